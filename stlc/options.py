@@ -17,6 +17,7 @@ from types import MappingProxyType, UnionType
 from typing import (
     Annotated,
     Any,
+    ClassVar,
     Concatenate,
     Literal,
     ParamSpec,
@@ -31,14 +32,15 @@ from stlc.diagnostics import usage
 
 P = ParamSpec("P")
 Subject = TypeVar("Subject")
-Options = TypeVar("Options")
+Chosen = TypeVar("Chosen")
 Result = TypeVar("Result")
 Clock = Literal["wall", "processor"]
 """Clock of a budget: wall time, or processor time as on an idle machine."""
 MOST_SEED = 2**63 - 1
 """Greatest seed of torch's random numbers."""
-RUNS = Path("runs")
-"""Folder of all runs."""
+
+
+_ENTRY = re.compile(r"^ {4}(\w+)(?: \((.+)\))?: (.+(?:\n {8}.*)*)", re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,25 +65,41 @@ class Option:
     most: float | None = None
     names: str = ""
 
+    @staticmethod
+    def described(options: type) -> dict[str, tuple[str | None, str]]:
+        """Placeholder and help of each option, from the attributes in the docstrings of a dataclass."""
+        text = "\n".join(inspect.cleandoc(each.__doc__ or "") for each in options.__mro__)
+        return {
+            name: (metavar or None, " ".join(told.split())) for name, metavar, told in _ENTRY.findall(text)
+        }
 
-_ENTRY = re.compile(r"^ {4}(\w+)(?: \((.+)\))?: (.+(?:\n {8}.*)*)", re.MULTILINE)
+    @staticmethod
+    def parts(hint: Any) -> tuple[Any, Option | None, Callable[[Any], Any] | None]:
+        """Type of an option without its description, the description, the function that reads its text."""
+        if get_origin(hint) in (Union, UnionType):
+            found = [Option.parts(each) for each in get_args(hint)]
+            options = [each for each in found if each[1] is not None]
+            return (hint, None, None) if not options else (options[0][0] | None, *options[0][1:])
+        held = get_args(hint) if get_origin(hint) is Annotated else ()
+        if len(held) < 2 or not isinstance(held[1], Option):
+            return hint, None, None
+        return held[0], held[1], held[2] if len(held) > 2 else None
 
-
-def described(options: type) -> dict[str, tuple[str | None, str]]:
-    """Placeholder and help of each option, from the attributes in the docstrings of a dataclass."""
-    text = "\n".join(inspect.cleandoc(each.__doc__ or "") for each in options.__mro__)
-    return {name: (metavar or None, " ".join(told.split())) for name, metavar, told in _ENTRY.findall(text)}
+    @staticmethod
+    def flags_of(name: str, option: Option | None) -> tuple[str, ...]:
+        """Flags of an option: its own, or `--held-out` of the field `held_out`."""
+        return (option and option.flags) or (f"--{name.rstrip('_').replace('_', '-')}",)
 
 
 def taking(
-    options: Callable[P, Options],
-) -> Callable[[Callable[[Subject, Options], Result]], Callable[Concatenate[Subject, P], Result]]:
+    options: Callable[P, Chosen],
+) -> Callable[[Callable[[Subject, Chosen], Result]], Callable[Concatenate[Subject, P], Result]]:
     """Return a decorator: a function of a subject and `options` takes their fields as keyword arguments.
 
     A path may be given as text.
     """
 
-    def decorate(function: Callable[[Subject, Options], Result]) -> Callable[Concatenate[Subject, P], Result]:
+    def decorate(function: Callable[[Subject, Chosen], Result]) -> Callable[Concatenate[Subject, P], Result]:
         own, hints = inspect.signature(function), get_type_hints(options)
         paths = {name for name, hint in hints.items() if Path in (hint, *get_args(hint))}
 
@@ -99,52 +117,6 @@ def taking(
         return called  # type: ignore[return-value]
 
     return decorate
-
-
-def given(options: Any) -> dict[str, Any]:
-    """Keyword arguments that give the options of a dataclass."""
-    return {each.name: getattr(options, each.name) for each in fields(options)}
-
-
-def parts(hint: Any) -> tuple[Any, Option | None, Callable[[Any], Any] | None]:
-    """Type of an option without its description, the description, and the function that reads its text."""
-    if get_origin(hint) in (Union, UnionType):
-        found = [parts(each) for each in get_args(hint)]
-        options = [each for each in found if each[1] is not None]
-        return (hint, None, None) if not options else (options[0][0] | None, *options[0][1:])
-    held = get_args(hint) if get_origin(hint) is Annotated else ()
-    if len(held) < 2 or not isinstance(held[1], Option):
-        return hint, None, None
-    return held[0], held[1], held[2] if len(held) > 2 else None
-
-
-def flags(name: str, option: Option | None) -> tuple[str, ...]:
-    """Flags of an option: its own, or `--held-out` of the field `held_out`."""
-    return (option and option.flags) or (f"--{name.rstrip('_').replace('_', '-')}",)
-
-
-def flags_of(options: type) -> dict[str, str]:
-    """Field of a dataclass of options -> its first flag."""
-    hints = get_type_hints(options, include_extras=True)
-    return {each.name: flags(each.name, parts(hints[each.name])[1])[0] for each in fields(options)}
-
-
-def words_of(options: Any) -> dict[str, tuple[str, ...]]:
-    """First flag of each option that is given -> the texts of its occurrences, "" for a switch."""
-    found = {}
-    for name, flag in flags_of(type(options)).items():
-        value = getattr(options, name)
-        if isinstance(value, Mapping):
-            value = [f"{key}={text}" for key, text in value.items()]
-        values = value if isinstance(value, list | tuple) else [value]
-        if values and value is not None and value is not False:
-            found[flag] = tuple("" if each is True else str(each) for each in values)
-    return found
-
-
-def command_line(words: Mapping[str, Sequence[str]]) -> list[str]:
-    """Words of a command line that gives options: flag -> the texts of its occurrences."""
-    return [each for flag, texts in words.items() for text in texts for each in (flag, text) if each]
 
 
 def require_no_jobs(cluster: str | None, jobs: int) -> None:
@@ -252,32 +224,71 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     return tuple(seeds)
 
 
-# ------------------------------------------------------------------ options of several operations
+class Options:
+    """Base class of the options of an operation, and the types of options that several operations have."""
 
-SYSTEM = Option(
-    "The system: as given, beside the spec, in systems/, in examples/, or installed.",
-    "FILE",
-    ("--system", "-s"),
-)
-SET = Option("Change a constant of the spec or a key of the system.", "NAME=VALUE", ("--set",), many=True)
-REQUIRE = Option(
-    "This requirement only; repeatable.", "NAME", ("--require",), many=True, names="requirement_names"
-)
-METHOD_OPTION = Option("An option of --method; repeatable.", "NAME=VALUE", ("--option",), many=True)
-SystemName = Annotated[str | None, SYSTEM]
-NONE_GIVEN: Mapping[str, str] = MappingProxyType({})
-Overrides = Annotated[Mapping[str, str], SET, parse_overrides]
-MethodOptions = Annotated[Mapping[str, str], METHOD_OPTION, parse_options]
-Seconds = Annotated[float, Option(metavar="TIME"), parse_seconds]
-Seeds = Annotated[Sequence[int], Option(metavar="SEEDS"), parse_seeds]
-ClockOption = Annotated[Clock, Option(metavar="wall|processor", flags=("--budget-clock",)), parse_clock]
-Natural = Annotated[int, Option(metavar="N", least=0)]
-Positive = Annotated[int, Option(metavar="N", least=1)]
-Seed = Annotated[int, Option("Seed of everything random.", least=0, most=MOST_SEED)]
-Jobs = Annotated[int, Option("Number of processes side by side.", flags=("--jobs", "-j"), least=1)]
-Cluster = Annotated[
-    str | None,
-    Option("Work on a Ray cluster, with as many processes as it has cores.", "auto|local|HOST:PORT"),
-]
-Runs = Annotated[Path, Option("Folder of all runs.", "DIR")]
-Python = Annotated[bool, Option("Run the Python that the run names: of a run that you trust.")]
+    __slots__ = ()
+    SET = Option("Change a constant of the spec or a key of the system.", "NAME=VALUE", ("--set",), many=True)
+    REQUIRE = Option(
+        "This requirement only; repeatable.", "NAME", ("--require",), many=True, names="requirement_names"
+    )
+    NONE: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    """No overrides, or no options of a method."""
+
+    System = Annotated[
+        str | None,
+        Option(
+            "The system: as given, beside the spec, in systems/, in examples/, or installed.",
+            "FILE",
+            ("--system", "-s"),
+        ),
+    ]
+    Overrides = Annotated[Mapping[str, str], SET, parse_overrides]
+    OfMethod = Annotated[
+        Mapping[str, str],
+        Option("An option of --method; repeatable.", "NAME=VALUE", ("--option",), many=True),
+        parse_options,
+    ]
+    Seconds = Annotated[float, Option(metavar="TIME"), parse_seconds]
+    Seeds = Annotated[Sequence[int], Option(metavar="SEEDS"), parse_seeds]
+    Clock = Annotated[Clock, Option(metavar="wall|processor", flags=("--budget-clock",)), parse_clock]
+    Natural = Annotated[int, Option(metavar="N", least=0)]
+    Positive = Annotated[int, Option(metavar="N", least=1)]
+    Seed = Annotated[int, Option("Seed of everything random.", least=0, most=MOST_SEED)]
+    Jobs = Annotated[int, Option("Number of processes side by side.", flags=("--jobs", "-j"), least=1)]
+    Cluster = Annotated[
+        str | None,
+        Option("Work on a Ray cluster, with as many processes as it has cores.", "auto|local|HOST:PORT"),
+    ]
+    Runs = Annotated[Path, Option("Folder of all runs.", "DIR")]
+    Python = Annotated[bool, Option("Run the Python that the run names: of a run that you trust.")]
+
+    def given(self) -> dict[str, Any]:
+        """Keyword arguments that give these options."""
+        return {name: getattr(self, name) for name in self.flags()}
+
+    @classmethod
+    def flags(cls) -> dict[str, str]:
+        """Field of the dataclass -> its first flag."""
+        hints = get_type_hints(cls, include_extras=True)
+        return {
+            each.name: Option.flags_of(each.name, Option.parts(hints[each.name])[1])[0]
+            for each in fields(cls)  # type: ignore[arg-type]
+        }
+
+    def words(self) -> dict[str, tuple[str, ...]]:
+        """First flag of each option that is given -> the texts of its occurrences, "" for a switch."""
+        found = {}
+        for name, flag in self.flags().items():
+            value = getattr(self, name)
+            if isinstance(value, Mapping):
+                value = [f"{key}={text}" for key, text in value.items()]
+            values = value if isinstance(value, list | tuple) else [value]
+            if values and value is not None and value is not False:
+                found[flag] = tuple("" if each is True else str(each) for each in values)
+        return found
+
+    @staticmethod
+    def command_line(words: Mapping[str, Sequence[str]]) -> list[str]:
+        """Words of a command line that gives options: flag -> the texts of its occurrences."""
+        return [each for flag, texts in words.items() for text in texts for each in (flag, text) if each]

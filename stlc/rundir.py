@@ -38,7 +38,6 @@ from stlc.files import (
     write_atomic,
 )
 from stlc.jsontext import data_of, dumps
-from stlc.options import RUNS
 from stlc.records import read
 from stlc.registry import did_you_mean
 from stlc.source import Source
@@ -135,6 +134,8 @@ class RunDir:
         path: path of the folder.
     """
 
+    RUNS: ClassVar = Path("runs")
+    """Folder of all runs."""
     LATEST: ClassVar = "latest"
     ROWS: ClassVar = "train.jsonl"
     SPEC: ClassVar = "spec.stl"
@@ -386,7 +387,7 @@ def of_kind(text: bytes, kind: Any) -> Any:
     return found
 
 
-def every_run(root: Path = RUNS) -> list[RunDir]:
+def every_run(root: Path = RunDir.RUNS) -> list[RunDir]:
     """Runs below `root` that have a record (`run.json`), ordered by specification and number."""
     numbered = [
         (path.parent.name, int(match[1]), path)

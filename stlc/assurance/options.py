@@ -9,30 +9,13 @@ from typing import Annotated
 
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.diagnostics import usage
-from stlc.options import (
-    REQUIRE,
-    RUNS,
-    ClockOption,
-    Cluster,
-    Jobs,
-    MethodOptions,
-    Natural,
-    Option,
-    Overrides,
-    Positive,
-    Python,
-    Runs,
-    Seconds,
-    Seed,
-    Seeds,
-    SystemName,
-    parse_limit,
-)
+from stlc.options import Option, Options, parse_limit
 from stlc.registry import GUARDS, PLANNERS
+from stlc.rundir import RunDir
 
 Plant = Annotated[Path | None, Option("A black box instead of a system (docs/plants.md).", "FILE")]
 GuardName = Annotated[str, Option(metavar="|".join(GUARDS.installed))]
-Requirements = Annotated[Sequence[str], REQUIRE, tuple]
+Requirements = Annotated[Sequence[str], Options.REQUIRE, tuple]
 Agents = Annotated[int | None, Option("Agents in each world; by default the system's.", least=1)]
 DriveSteps = Annotated[int | None, Option("Steps of each drive; by default the system's.", least=1)]
 TimeLimit = Annotated[
@@ -57,7 +40,7 @@ Share = Annotated[float | None, Option(metavar="SHARE")]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VerifyOptions:
+class VerifyOptions(Options):
     """Options of proofs on boxes of initial states.
 
     Attributes:
@@ -71,21 +54,21 @@ class VerifyOptions:
     """
 
     controller: Path | None = None
-    period: Seconds | None = None
+    period: Options.Seconds | None = None
     continuous: bool = False
-    system: SystemName = None
-    budget: Seconds = 60.0
-    boxes: Positive | None = None
-    states: Natural = 0
-    clock: ClockOption = "wall"
-    jobs: Jobs = 1
-    seed: Seed = 0
-    python: Python = False
-    runs: Runs = RUNS
+    system: Options.System = None
+    budget: Options.Seconds = 60.0
+    boxes: Options.Positive | None = None
+    states: Options.Natural = 0
+    clock: Options.Clock = "wall"
+    jobs: Options.Jobs = 1
+    seed: Options.Seed = 0
+    python: Options.Python = False
+    runs: Options.Runs = RunDir.RUNS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FalsifyOptions:
+class FalsifyOptions(Options):
     """Options of a search for violations.
 
     Attributes:
@@ -101,24 +84,24 @@ class FalsifyOptions:
         replay (FILE): Simulate this counterexample again, and compare.
     """
 
-    system: SystemName = None
+    system: Options.System = None
     plant: Plant = None
     require: Requirements = ()
-    simulations: Positive = 300
-    budget: Seconds | None = None
-    seed: Seed = 0
-    jobs: Jobs = 1
-    cluster: Cluster = None
-    batch: Positive | None = None
+    simulations: Options.Positive = 300
+    budget: Options.Seconds | None = None
+    seed: Options.Seed = 0
+    jobs: Options.Jobs = 1
+    cluster: Options.Cluster = None
+    batch: Options.Positive | None = None
     random: bool = False
     guard: GuardName = GUARDS.default
-    agents: Positive | None = None
-    steps: Positive | None = None
+    agents: Options.Positive | None = None
+    steps: Options.Positive | None = None
     scenario: str | None = None
     out: Annotated[Path, Option(flags=("--out", "-o"))] = Path("counterexamples")
     replay: Path | None = None
-    overrides: Overrides = field(default_factory=dict)
-    runs: Runs = RUNS
+    overrides: Options.Overrides = field(default_factory=dict)
+    runs: Options.Runs = RunDir.RUNS
 
 
 def _shift(text: str) -> float:
@@ -128,7 +111,7 @@ def _shift(text: str) -> float:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CertifyOptions:
+class CertifyOptions(Options):
     """Options of a certificate.
 
     Attributes:
@@ -158,18 +141,18 @@ class CertifyOptions:
     agents: Agents = None
     plant: Plant = None
     system: Annotated[str | None, Option(flags=("--system", "-s"))] = None
-    jobs: Jobs = 1
-    seeds: Seeds | None = None
-    drives: Positive = 1000
+    jobs: Options.Jobs = 1
+    seeds: Options.Seeds | None = None
+    drives: Options.Positive = 1000
     require: Requirements = ()
     out: Path | None = None
     verify: Path | None = None
-    overrides: Overrides = field(default_factory=dict)
-    runs: Runs = RUNS
+    overrides: Options.Overrides = field(default_factory=dict)
+    runs: Options.Runs = RunDir.RUNS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SimulateOptions:
+class SimulateOptions(Options):
     """Options of closed-loop runs of a policy, a planner or a plant.
 
     Attributes:
@@ -191,9 +174,9 @@ class SimulateOptions:
         None
     )
     time_limit: TimeLimit = None
-    known_feasible: Natural = 0
+    known_feasible: Options.Natural = 0
     margin: Margin = ()
-    seeds: Seeds = tuple(range(10))
+    seeds: Options.Seeds = tuple(range(10))
     steps: DriveSteps = None
     agents: Agents = None
     record: Path | None = None
@@ -208,15 +191,15 @@ class SimulateOptions:
             ("--method", "-m"),
         ),
     ] = None
-    options: MethodOptions = field(default_factory=dict)
-    budget: Seconds | None = None
+    options: Options.OfMethod = field(default_factory=dict)
+    budget: Options.Seconds | None = None
     plant: Plant = None
     start: Annotated[str | None, Option(flags=("--from",))] = None
-    jobs: Jobs = 1
+    jobs: Options.Jobs = 1
     stream: bool = False
-    system: SystemName = None
-    overrides: Overrides = field(default_factory=dict)
-    runs: Runs = RUNS
+    system: Options.System = None
+    overrides: Options.Overrides = field(default_factory=dict)
+    runs: Options.Runs = RunDir.RUNS
     pictures: Annotated[bool, Option(flags=("--pictures/--no-pictures",))] = False
 
     @property

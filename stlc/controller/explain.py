@@ -10,9 +10,8 @@ from stlc.diagnostics import CODES, usage
 from stlc.files import SPEC_SUFFIXES, STDIN, find_spec, has_wildcard, read_source, seen_at
 from stlc.grammar import ast
 from stlc.grammar.manual import CodeList, Page, SpecInWords, in_words, read_page
-from stlc.options import RUNS
 from stlc.registry import did_you_mean
-from stlc.rundir import recorded_trace
+from stlc.rundir import RunDir, recorded_trace
 
 if TYPE_CHECKING:
     from stlc.controller.guard.coverage import Guarantee
@@ -30,7 +29,7 @@ def explain(
     *,
     require: tuple[str, ...] = (),
     guarantee: bool = False,
-    runs: Path = RUNS,
+    runs: Path = RunDir.RUNS,
     **options: Any,
 ) -> Explained:
     """Explain a code, a specification, the violations of a recording, or the backup policy of a run.

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from stlc.diagnostics import usage
 from stlc.files import SPEC_SUFFIXES, find_spec
 from stlc.foreign import driving
-from stlc.options import RUNS, Option, Overrides, Python, Runs, Seconds, SystemName, taking
+from stlc.options import Option, Options, taking
+from stlc.rundir import RunDir
 
 if TYPE_CHECKING:
     from stlc.controller.run.run import Run
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ExportOptions:
+class ExportOptions(Options):
     """Options of the export of a controller or of a monitor.
 
     Attributes:
@@ -37,12 +38,12 @@ class ExportOptions:
     out: Annotated[Path | None, Option(flags=("--out", "-o"))] = None
     precision: str | None = None
     single: Annotated[bool, Option(flags=("--float",))] = False
-    dt: Seconds | None = None
+    dt: Options.Seconds | None = None
     at: str | None = None
-    system: SystemName = None
-    overrides: Overrides = field(default_factory=dict)
-    python: Python = False
-    runs: Runs = RUNS
+    system: Options.System = None
+    overrides: Options.Overrides = field(default_factory=dict)
+    python: Options.Python = False
+    runs: Options.Runs = RunDir.RUNS
 
 
 @taking(ExportOptions)

@@ -21,7 +21,6 @@ from stlc.controller.run.run import Run, folder_of
 from stlc.escape import operand, shell
 from stlc.files import write_atomic
 from stlc.foreign import driving
-from stlc.options import RUNS
 from stlc.rundir import RunDir
 from stlc.version import __version__
 from stlc.view import require_drawing
@@ -89,7 +88,7 @@ class Report:
         return tuple(lines)
 
 
-def report(run: Run | Path | str = "latest", *, python: bool = False, runs: Path = RUNS) -> Report:
+def report(run: Run | Path | str = "latest", *, python: bool = False, runs: Path = RunDir.RUNS) -> Report:
     """Write a self-contained page with the pictures of a run into its folder.
 
     Args:

@@ -13,7 +13,7 @@ from stlc.controller.training.launch import open_folder
 from stlc.controller.training.loop import Watch, prepare, run
 from stlc.controller.training.options import TrainOptions
 from stlc.diagnostics import usage
-from stlc.options import given, taking
+from stlc.options import taking
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,7 +36,7 @@ def train(task: Task, options: ShownTraining) -> Run:
         UsageError: U101, `budget` is not a positive number, `steps` is below 1, `seed` is negative, or there
             is no such method.
     """
-    chosen = given(options)
+    chosen = options.given()
     progress, budget, steps, seed = (chosen.pop("progress"), options.budget, options.steps, options.seed)
     if budget is not None and not 0.0 < budget < math.inf:
         raise usage(f"a training time of {budget} s is not a positive number")

@@ -9,7 +9,6 @@ from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command
 from stlc.escape import visible
 from stlc.export.targets import ExportOptions
-from stlc.options import given
 
 if TYPE_CHECKING:
     from stlc.export.monitor import ExportedMonitor
@@ -42,7 +41,7 @@ def export(
     """
     from stlc.export.targets import export as write
 
-    done = write(run, **given(options))
+    done = write(run, **options.given())
 
     def show() -> None:
         for line in done.remarks:

@@ -13,7 +13,6 @@ from stlc.cli.framework.output import Answer, emit, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, MissingError
 from stlc.escape import visible
-from stlc.options import given
 
 if TYPE_CHECKING:
     from stlc.assurance.falsified import (
@@ -58,7 +57,7 @@ def falsify(
     from stlc.assurance.falsification import falsify as search
     from stlc.assurance.falsified import FalsifiedSystem, ReplayedFinding
 
-    found = search(target, **given(options))
+    found = search(target, **options.given())
     if isinstance(found, ReplayedFinding):
         return Answer(found, lambda: emit("\n".join(_again(found))), int(found.reason is not None))
     if not isinstance(found, FalsifiedSystem):

@@ -15,7 +15,7 @@ from stlc.cli.framework.program import command
 from stlc.diagnostics import CODES, Diagnostic, usage
 from stlc.escape import sarif_message, uri, workflow_data, workflow_property
 from stlc.files import STDIN, spec_files
-from stlc.options import SystemName
+from stlc.options import Options
 from stlc.source import Span
 from stlc.version import __version__
 
@@ -45,7 +45,7 @@ def lint(
     ignore: Annotated[str | None, typer.Option(metavar="CODES", help="Warnings to leave out.")] = None,
     format_: Annotated[Format, typer.Option("--format", help="How findings are written.")] = "text",
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 if there are warnings.")] = False,
-    system: SystemName = None,
+    system: Options.System = None,
     trace: Annotated[
         Path | None,
         typer.Option("--trace", metavar="FILE", help="Also tell what this recording does not test."),

@@ -17,16 +17,7 @@ from stlc.cli.framework.options import (
 from stlc.cli.framework.output import Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command, noting_signals
 from stlc.diagnostics import usage
-from stlc.options import (
-    NONE_GIVEN,
-    MethodOptions,
-    Option,
-    Overrides,
-    Seed,
-    SystemName,
-    parse_count,
-    parse_seconds,
-)
+from stlc.options import Option, Options, parse_count, parse_seconds
 from stlc.registry import PLANNERS
 
 if TYPE_CHECKING:
@@ -45,7 +36,7 @@ if TYPE_CHECKING:
 )
 def plan(
     spec: Annotated[Path, typer.Argument(metavar="SPEC", help="The specification, a .stl file.")],
-    system: SystemName = None,
+    system: Options.System = None,
     from_: Annotated[
         str,
         typer.Option("--from", metavar="random|STATE|TRACE", help="Initial states, such as `x=1, v=2 m/s`."),
@@ -62,7 +53,7 @@ def plan(
         ),
         PLANNERS.chosen,
     ] = PLANNERS.default,
-    option: MethodOptions = NONE_GIVEN,
+    option: Options.OfMethod = Options.NONE,
     budget: Annotated[
         float, Option("Processor time per initial state at most; by default 1s.", "TIME"), parse_seconds
     ] = 1.0,
@@ -72,7 +63,7 @@ def plan(
     target: Annotated[
         str, typer.Option(metavar="RHO|max", help="Robustness at which the search ends.")
     ] = "0",
-    seed: Seed = 0,
+    seed: Options.Seed = 0,
     tube: Annotated[
         str | None,
         typer.Option(
@@ -83,7 +74,7 @@ def plan(
         Path, typer.Option("--out", "-o", metavar="FILE", help="Trace of the plans (.npz, .csv, .mcap).")
     ] = Path("plan.npz"),
     fail_under: FailUnderOption = None,
-    set_: Overrides = NONE_GIVEN,
+    set_: Options.Overrides = Options.NONE,
 ) -> Answer[Plans]:
     """Plan from initial states, without training.
 

@@ -9,14 +9,16 @@ from stlc.cli.framework.options import RunArgument
 from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command
 from stlc.escape import visible
-from stlc.options import Python, Runs
+from stlc.options import Options
 
 if TYPE_CHECKING:
     from stlc.view.report import Report
 
 
 @command("stlc report latest")
-def report(run: RunArgument = "latest", python: Python = False, runs: Runs = Path("runs")) -> Answer[Report]:
+def report(
+    run: RunArgument = "latest", python: Options.Python = False, runs: Options.Runs = Path("runs")
+) -> Answer[Report]:
     """Write a self-contained report.html with the pictures of a run.
 
     The report is written to the run's folder. It shows training curves, signals with the robustness of each

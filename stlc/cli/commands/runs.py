@@ -17,7 +17,7 @@ from stlc.cli.framework.output import Answer, emit, say, table
 from stlc.cli.framework.program import group, subcommand
 from stlc.diagnostics import StlcError, usage
 from stlc.escape import visible
-from stlc.options import RUNS, Runs
+from stlc.options import Options
 from stlc.rundir import RunDir, every_run, remove_run
 
 
@@ -91,7 +91,7 @@ GROUP = group("List, show, compare and remove runs.", "stlc runs", default=_defa
 @subcommand(GROUP, "list", "stlc runs list --sort acc")
 def list_(
     sort: Annotated[Sort, typer.Option(help="Newest last, best last, or by name.")] = "time",
-    runs: Runs = RUNS,
+    runs: Options.Runs = RunDir.RUNS,
 ) -> Answer[RunList]:
     """List all runs."""
     found = [(run, *_record(run)) for run in every_run(runs)]
@@ -111,7 +111,7 @@ def list_(
 
 
 @subcommand(GROUP, "show", "stlc runs show latest")
-def show(run: RunArgument = "latest", runs: Runs = RUNS) -> Answer[RunContent]:
+def show(run: RunArgument = "latest", runs: Options.Runs = RunDir.RUNS) -> Answer[RunContent]:
     """Show the settings and results of a run."""
     folder = RunDir.open(run, runs)
     record = folder.record()
@@ -131,7 +131,7 @@ def show(run: RunArgument = "latest", runs: Runs = RUNS) -> Answer[RunContent]:
 def diff(
     first: RunArgument,
     second: Annotated[str, typer.Argument(metavar="OTHER", help="The run to compare with.")] = "latest",
-    runs: Runs = RUNS,
+    runs: Options.Runs = RunDir.RUNS,
 ) -> Answer[RunComparison]:
     """Show the differences between two runs: options, inputs, results.
 
@@ -156,7 +156,7 @@ def rm(
         list[str], typer.Argument(metavar="RUN…", help="Runs to remove.", autocompletion=run_names)
     ],
     force: Annotated[bool, typer.Option("--force", help="Also runs in progress, and damaged ones.")] = False,
-    runs: Runs = RUNS,
+    runs: Options.Runs = RunDir.RUNS,
 ) -> Answer[RemovedRuns]:
     """Remove the folders of runs.
 

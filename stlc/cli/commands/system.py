@@ -11,7 +11,7 @@ import typer
 from stlc.cli.framework.output import Answer, emit, say, show_diagnostics, table
 from stlc.cli.framework.program import group, subcommand
 from stlc.escape import visible
-from stlc.options import NONE_GIVEN, Overrides, Seed
+from stlc.options import Options
 
 if TYPE_CHECKING:
     from stlc.diagnostics import Diagnostic
@@ -28,7 +28,7 @@ GROUP = group("Show, check and list system files.", "stlc system show car.yaml")
 
 
 @subcommand(GROUP, "show", "stlc system show car.yaml")
-def show(system: _File, set_: Overrides = NONE_GIVEN) -> Answer[SystemFacts]:
+def show(system: _File, set_: Options.Overrides = Options.NONE) -> Answer[SystemFacts]:
     """Show the declarations of a system file, from states to scenarios."""
     from stlc.dynamics.declaration.decl import describe as in_words
     from stlc.dynamics.facts import SystemFacts
@@ -49,8 +49,8 @@ def check(
     steps: Annotated[
         int, typer.Option(min=0, help="Steps of the rollouts; with 0 the file is only read.")
     ] = 32,
-    seed: Seed = 0,
-    set_: Overrides = NONE_GIVEN,
+    seed: Options.Seed = 0,
+    set_: Options.Overrides = Options.NONE,
 ) -> Answer[SystemFacts]:
     """Validate a system file with random rollouts.
 

@@ -14,7 +14,6 @@ from stlc.cli.framework.output import Answer, emit, show_diagnostics, table
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic
 from stlc.escape import visible
-from stlc.options import given
 
 if TYPE_CHECKING:
     from stlc.assurance.verification.verified import Verified
@@ -57,7 +56,7 @@ def verify(
     """
     from stlc.assurance.verification.verified import verify as prove
 
-    found = prove(run, **given(options))
+    found = prove(run, **options.given())
     lost = (_lost(found.lost),) if found.lost else ()
 
     def show() -> None:

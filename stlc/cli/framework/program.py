@@ -32,7 +32,7 @@ from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.output import COLOR, QUIET, Answer, ColorMode, emit, noticing, silence
 from stlc.diagnostics import Diagnostic, PluginError, UsageError
 from stlc.foreign import driving
-from stlc.options import Option, described, flags, parts
+from stlc.options import Option
 from stlc.registry import Registry
 from stlc.version import __version__
 
@@ -134,7 +134,7 @@ def flat(function: Callable[..., Any]) -> Callable[..., Any]:
             spread.append(parameter.replace(annotation=hints.get(name)))
             continue
         own = get_type_hints(groups[name], include_extras=True)
-        told |= described(groups[name])
+        told |= Option.described(groups[name])
         spread += [
             parameter.replace(
                 name=each.name, annotation=own[each.name], default=getattr(parameter.default, each.name)
@@ -144,7 +144,9 @@ def flat(function: Callable[..., Any]) -> Callable[..., Any]:
     if answers and not passed:
         option = inspect.Parameter.POSITIONAL_OR_KEYWORD
         spread.append(inspect.Parameter("json", option, default=False, annotation=JsonOption))
-    read = {each.name: (each.default, parse) for each in spread if (parse := parts(each.annotation)[2])}
+    read = {
+        each.name: (each.default, parse) for each in spread if (parse := Option.parts(each.annotation)[2])
+    }
     spread = [_on_command_line(each, *told.get(each.name, (None, ""))) for each in spread]
 
     def run(**values: Any) -> Any:
@@ -166,7 +168,7 @@ def flat(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def _on_command_line(parameter: inspect.Parameter, metavar: str | None, told: str) -> inspect.Parameter:
     """Return a parameter as typer declares it, if an `Option` or the docstring (`told`) describes it."""
-    kind, option, parse = parts(parameter.annotation)
+    kind, option, parse = Option.parts(parameter.annotation)
     if option is None and not told:
         return parameter
     option = option or Option()
@@ -175,7 +177,7 @@ def _on_command_line(parameter: inspect.Parameter, metavar: str | None, told: st
         kind = list[str] | None if option.many else str | None
         parameter = parameter.replace(default=None)
     found = typer.Option(
-        *flags(parameter.name, option),
+        *Option.flags_of(parameter.name, option),
         help=f"{help_}.",
         metavar=metavar or option.metavar,
         min=option.least,

@@ -19,7 +19,6 @@ from stlc.controller.parallel.jobs import Job, JobResult, start
 from stlc.controller.parallel.ray_cluster import RayWorkers
 from stlc.controller.parallel.workers import CallFiles, LostCall
 from stlc.files import RECORD, atomic_path
-from stlc.options import RUNS
 from stlc.rundir import RunDir
 
 LOST = -9
@@ -77,7 +76,7 @@ class RayExecutor:
 
 
 def _runs(job: Job) -> Path:
-    return absolute(job.runs or RUNS)
+    return absolute(job.runs or RunDir.RUNS)
 
 
 @contextmanager

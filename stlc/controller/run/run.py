@@ -18,7 +18,6 @@ from stlc.dynamics.scenario import scenario_constants, under
 from stlc.dynamics.system import System
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
-from stlc.options import RUNS
 from stlc.plugins import variable
 from stlc.provenance import sha256
 from stlc.registry import GUARDS, METHODS, PLANNERS, PackageRegistry
@@ -57,7 +56,7 @@ class Run:
         cls,
         where: Path | str = "latest",
         *,
-        root: Path = RUNS,
+        root: Path = RunDir.RUNS,
         device: str = "cpu",
         overrides: Mapping[str, str] | None = None,
         scenario: str | None = None,
@@ -128,7 +127,7 @@ class Run:
         return self.policy.plan_judged(x0)
 
 
-def folder_of(run: Run | Path | str, runs: Path = RUNS) -> RunDir:
+def folder_of(run: Run | Path | str, runs: Path = RunDir.RUNS) -> RunDir:
     """Folder of a run, or of the one that is called so below `runs`; see `RunDir.open`."""
     return run.dir if isinstance(run, Run) else RunDir.open(run, runs)
 

@@ -14,7 +14,6 @@ from stlc.controller.search.planner import prepared
 from stlc.controller.search.planner_policy import PlannerChoice, planner_of
 from stlc.controller.training.config import ENGINE_VERSION, TrainConfig, resolve_config
 from stlc.dynamics.functions import function_files
-from stlc.options import RUNS
 from stlc.provenance import git_state, hardware, sha256, versions
 from stlc.registry import METHODS, PLANNERS
 from stlc.rundir import RunDir, now, require_name
@@ -38,7 +37,7 @@ class Launch:
         command: command line, which the run's record keeps.
     """
 
-    root: Path = RUNS
+    root: Path = RunDir.RUNS
     name: str | None = None
     overrides: Mapping[str, str] = field(default_factory=dict)
     command: Sequence[str] = ()

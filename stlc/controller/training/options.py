@@ -9,7 +9,7 @@ from typing import Annotated
 from stlc.controller.run.config import DRIVES, HELD_OUT
 from stlc.controller.training.budget import StepSchedule
 from stlc.diagnostics import UsageError, usage
-from stlc.options import ClockOption, MethodOptions, Natural, Option, Positive, Seconds, Seed, parse_count
+from stlc.options import Option, Options, parse_count
 from stlc.registry import METHODS
 
 
@@ -53,7 +53,7 @@ def parse_rate(text: str) -> float:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TrainOptions:
+class TrainOptions(Options):
     """Options of a training; None leaves the choice to the system file, then to the method.
 
     Attributes:
@@ -76,16 +76,16 @@ class TrainOptions:
     method: Annotated[str | None, Option(metavar="|".join((*METHODS.installed, "FILE.py"))), parse_method] = (
         None
     )
-    budget: Seconds | None = None
-    clock: ClockOption = "wall"
+    budget: Options.Seconds | None = None
+    clock: Options.Clock = "wall"
     steps: Annotated[int | StepSchedule | None, Option(), parse_steps] = None
-    seed: Seed | None = None
+    seed: Options.Seed | None = None
     device: str = "cpu"
-    threads: Positive | None = None
-    plans: Positive | None = None
+    threads: Options.Positive | None = None
+    plans: Options.Positive | None = None
     lr: Annotated[float | None, Option(), parse_rate] = None
-    batch: Positive | None = None
-    held_out: Positive = HELD_OUT
-    drives: Natural = DRIVES
-    options: MethodOptions = field(default_factory=dict)
+    batch: Options.Positive | None = None
+    held_out: Options.Positive = HELD_OUT
+    drives: Options.Natural = DRIVES
+    options: Options.OfMethod = field(default_factory=dict)
     falsify: bool = False

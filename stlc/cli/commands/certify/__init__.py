@@ -14,7 +14,6 @@ from stlc.cli.framework.output import Answer, emit
 from stlc.cli.framework.program import command
 from stlc.escape import operand, shell, visible
 from stlc.jsontext import plain
-from stlc.options import given
 
 if TYPE_CHECKING:
     from stlc.assurance.campaign import CertificateCheck, Difference
@@ -59,7 +58,7 @@ def certify(
     from stlc.assurance.campaign import CertificateCheck
     from stlc.assurance.certificates import certify as bounded
 
-    found: Any = bounded(run, **given(options))
+    found: Any = bounded(run, **options.given())
     if isinstance(found, CertificateCheck):
         lines, code = _compared_lines(found), int(not found.found.same)
     else:

@@ -21,7 +21,7 @@ from stlc.diagnostics import UsageError, usage
 from stlc.escape import visible
 from stlc.files import SPEC_SUFFIXES, STDIN, has_wildcard, matching_traces, real, write_atomic
 from stlc.jsontext import plain
-from stlc.options import Cluster, require_no_jobs
+from stlc.options import Options, require_no_jobs
 
 if TYPE_CHECKING:
     from io import BufferedReader
@@ -84,7 +84,7 @@ def check(
     jobs: Annotated[
         int, typer.Option("--jobs", "-j", min=0, help="Number of processes; 0: one per core.")
     ] = 1,
-    cluster: Cluster = None,
+    cluster: Options.Cluster = None,
     chunk: Annotated[
         int,
         typer.Option(

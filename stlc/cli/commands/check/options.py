@@ -14,17 +14,7 @@ from stlc.compile.semantics.tolerance import TOLERANCE, End
 from stlc.diagnostics import usage
 from stlc.escape import operand
 from stlc.monitor.check import Question, seconds_of
-from stlc.options import (
-    REQUIRE,
-    SET,
-    Runs,
-    SystemName,
-    command_line,
-    flags_of,
-    parse_overrides,
-    parse_pairs,
-    words_of,
-)
+from stlc.options import Options, parse_overrides, parse_pairs
 from stlc.registry import SEMANTICS
 
 if TYPE_CHECKING:
@@ -34,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Traces:
+class Traces(Options):
     """Command-line options that say how traces are read and judged.
 
     Attributes:
@@ -52,9 +42,9 @@ class Traces:
     """
 
     spec: Path | None = None
-    system: SystemName = None
-    set_: Annotated[list[str] | None, SET] = None
-    require: Annotated[list[str] | None, REQUIRE] = None
+    system: Options.System = None
+    set_: Annotated[list[str] | None, Options.SET] = None
+    require: Annotated[list[str] | None, Options.REQUIRE] = None
     map_: list[str] | None = None
     resample: str | None = None
     between: list[str] | None = None
@@ -64,24 +54,24 @@ class Traces:
     fps: float | None = None
     group: str | None = None
     columns: str | None = None
-    runs: Runs = Path("runs")
+    runs: Options.Runs = Path("runs")
 
     def words(self) -> dict[str, tuple[str, ...]]:
         """The options as they were given: flag -> the texts of all occurrences, "" for a switch."""
-        return {flag: texts for flag, texts in words_of(self).items() if flag != "--runs"}
+        return {flag: texts for flag, texts in Options.words(self).items() if flag != "--runs"}
 
     @property
     def replay(self) -> tuple[str, ...]:
         """Words of a command line that reads the same trace, to explain one of its violations."""
         given = self.words()
         words = [operand(spec) for spec in given.get("--spec", ())]
-        words += command_line({flag: given.get(flag, ()) for flag in _REPLAYED})
+        words += Options.command_line({flag: given.get(flag, ()) for flag in _REPLAYED})
         return (*words, *(("--group", "none") if self.group == "none" else ()))
 
     @classmethod
     def from_words(cls, words: Mapping[str, Sequence[str]]) -> Self:
         """Return the options that `words` gave. Raises ValueError for an option that there is not."""
-        declared = {flag: name for name, flag in flags_of(cls).items()}
+        declared = {flag: name for name, flag in cls.flags().items()}
         hints, given = get_type_hints(cls), dict[str, Any]()
         for name, values in words.items():
             kind = str(hints.get(declared.get(name, "")))

@@ -12,7 +12,7 @@ import typer
 from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.output import Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
-from stlc.options import NONE_GIVEN, Overrides, SystemName
+from stlc.options import Options
 
 if TYPE_CHECKING:
     from stlc.compile.described import CompiledSpec
@@ -45,8 +45,8 @@ def compile_(
     files: Annotated[
         list[str], typer.Argument(metavar="SPEC", help="The specification; for ast and dot several, or -.")
     ],
-    system: SystemName = None,
-    set_: Overrides = NONE_GIVEN,
+    system: Options.System = None,
+    set_: Options.Overrides = Options.NONE,
     show: Annotated[
         Part, typer.Option("--show", metavar="PART", help="all, steps, states, ir, ast, or dot.")
     ] = "all",

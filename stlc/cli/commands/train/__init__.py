@@ -19,19 +19,7 @@ from stlc.cli.framework.program import command
 from stlc.controller.training.budget import StepSchedule
 from stlc.controller.training.options import TrainOptions
 from stlc.diagnostics import MissingError, StlcError, UsageError, usage
-from stlc.options import (
-    NONE_GIVEN,
-    RUNS,
-    Cluster,
-    Jobs,
-    Option,
-    Overrides,
-    Runs,
-    SystemName,
-    flags_of,
-    given,
-    parse_seeds,
-)
+from stlc.options import Option, Options, parse_seeds
 from stlc.registry import METHODS
 from stlc.rundir import RunDir
 
@@ -61,7 +49,7 @@ def train(
             metavar="SPEC", help="The specification, a .stl file; several are trained for one by one."
         ),
     ] = None,
-    system: SystemName = None,
+    system: Options.System = None,
     options: TrainOptions = OPTIONS,
     seeds: Annotated[
         Sequence[int],
@@ -69,8 +57,8 @@ def train(
         parse_seeds,
     ]
     | None = None,
-    jobs: Jobs = 1,
-    cluster: Cluster = None,
+    jobs: Options.Jobs = 1,
+    cluster: Options.Cluster = None,
     resume: Annotated[
         str | None,
         typer.Option(metavar="RUN", help="Go on with an interrupted run.", autocompletion=run_names),
@@ -79,9 +67,9 @@ def train(
     log: Annotated[
         str | None, typer.Option(metavar="tensorboard", help="Also write the curves for TensorBoard.")
     ] = None,
-    runs: Runs = RUNS,
+    runs: Options.Runs = RunDir.RUNS,
     pictures: Annotated[bool, typer.Option(help="Draw pictures and the report.")] = True,
-    set_: Overrides = NONE_GIVEN,
+    set_: Options.Overrides = Options.NONE,
 ) -> Answer[TrainedRun | TrainedRuns]:
     """Train a policy that satisfies a specification.
 
@@ -90,7 +78,7 @@ def train(
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads of torch must not busy-wait
     specs = tuple(dict.fromkeys(spec or ()))
     usual = TrainOptions()
-    changed = {name: value for name, value in given(options).items() if value != getattr(usual, name)}
+    changed = {name: value for name, value in options.given().items() if value != getattr(usual, name)}
     if "budget" in changed and "steps" in changed:
         raise usage("`--budget` and `--steps` contradict each other")
     own = {"--system": system, "--seeds": seeds, "--name": name, "--set": set_ or None, "--cluster": cluster}
@@ -107,7 +95,7 @@ def train(
     from stlc.controller.training.config import TrainConfig
     from stlc.controller.training.launch import Launch
 
-    config = TrainConfig(**given(options))
+    config = TrainConfig(**options.given())
     launch = Launch(root=runs, name=name, overrides=set_, command=sys.argv[1:])
     if len(specs) < 2:  # errors of a single specification are reported once, before the first of several runs
         with one_voice():
@@ -238,7 +226,7 @@ def _refuse_on_resume(own: Mapping[str, object], changed: Mapping[str, object]) 
     Only the length of the training and `--device` can be changed. `changed` are options of the training.
     """
     named = [option for option, value in own.items() if value is not None]
-    named += [flag for name, flag in flags_of(TrainOptions).items() if name in changed]
+    named += [flag for name, flag in TrainOptions.flags().items() if name in changed]
     named = [option for option in named if option not in ("--budget", "--steps", "--device")]
     if named:
         message = f"{', '.join(named)} cannot change when a run is resumed"

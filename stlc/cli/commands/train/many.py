@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from stlc.cli.commands.train.trained import JudgedTraining, TrainedJob, TrainedRun, TrainedRuns
 from stlc.cli.framework.output import Answer, emit, say, table
 from stlc.escape import operand
-from stlc.options import command_line, words_of
+from stlc.options import Options
 
 if TYPE_CHECKING:
     from stlc.controller.parallel.jobs import Job, JobResult
@@ -86,12 +86,12 @@ class Many:
         threads = options.threads or (1 if self.jobs > 1 or self.cluster is not None else None)
         seeded = "" if part.seed is None else f"-seed{part.seed}"
         name = None if launch.name is None else f"{launch.name}{seeded}"
-        words = words_of(replace(options, seed=part.seed, threads=threads))
+        words = replace(options, seed=part.seed, threads=threads).words()
         own = {"--system": self.system, "--name": name, "--log": self.log, "--runs": launch.root}
         words |= {flag: (str(value),) for flag, value in own.items() if value is not None}
         words["--set"] = tuple(f"{key}={value}" for key, value in launch.overrides.items())
         drawn = () if self.pictures else ("--no-pictures",)
-        arguments = (operand(str(part.spec)), *command_line(words), *drawn)
+        arguments = (operand(str(part.spec)), *Options.command_line(words), *drawn)
         if self.cluster is None:
             return Job(self.name(part), arguments)
         from stlc.controller.problem.inputs import input_files

@@ -19,7 +19,6 @@ from stlc.controller.training.failures import FalsificationRounds
 from stlc.controller.training.final_evaluation import TrainingOutcome
 from stlc.controller.training.loop import Watch
 from stlc.diagnostics import StlcError
-from stlc.options import RUNS
 from stlc.records import from_json
 from stlc.rundir import RunDir, Status
 from stlc.stopping import age, leaving
@@ -203,8 +202,8 @@ def _commands(folder: RunDir, ranks: int = 1) -> Commands:
     The commands name the run as briefly as possible. The newest run is not named, and a run below `runs` is
     named without its path.
     """
-    newest = (RUNS / RunDir.LATEST).resolve() == folder.path.resolve()
-    usual = folder.path.resolve().parent.parent == RUNS.resolve()
+    newest = (RunDir.RUNS / RunDir.LATEST).resolve() == folder.path.resolve()
+    usual = folder.path.resolve().parent.parent == RunDir.RUNS.resolve()
     start = "stlc" if ranks == 1 else f"torchrun --nproc-per-node {ranks} -m stlc"
     name = folder.name if usual else folder.shown
     return Commands.of(name, folder.record(), newest=newest, start=start)
