@@ -22,7 +22,7 @@ from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.kinematics import chain, position, read_urdf
-from stlc.files import find_system
+from stlc.files import File
 
 Point: TypeAlias = tuple[float, ...]
 
@@ -126,7 +126,7 @@ class _ArmDraw(Draw):
 @cache
 def _arm() -> tuple[Point, ...]:
     """Points along the links of the arm in its initial position, as tuples (x, y, z)."""
-    text = read_urdf(find_system("examples/panda.yaml").with_name("panda.urdf"))
+    text = read_urdf(File("examples/panda.yaml").system().with_name("panda.urdf"))
     places = np.array([_position(text, link) for link in LINKS])
     shares = np.arange(BETWEEN + 1)[:, None, None] / (BETWEEN + 1)
     points = ((1.0 - shares) * places[:-1] + shares * places[1:]).reshape(-1, 3)

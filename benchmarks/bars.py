@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from benchmarks.curves import COLUMNS
-from stlc.files import write_atomic
+from stlc.files import File
 from stlc.view import available
 from stlc.view.style import BLUE, GREEN, INK, MUTED, ORANGE, PINK, SKY, Picture, new_figure, picture_style
 
@@ -64,8 +64,8 @@ def draw(facets: Sequence[Facet], folder: Path) -> tuple[Picture, ...]:
     names = list(dict.fromkeys(bar.label for facet in shown for bar in facet.bars))
     bars = _grid(shown, lambda axes, facet: _draw_bars(axes, facet, names), 0.16 * len(names) + 0.7)
     times = _grid(shown, lambda axes, facet: _draw_points(axes, facet, names), 2.2)
-    write_atomic(folder / BARS, bars.svg())
-    write_atomic(folder / TIMES, times.svg())
+    File(folder / BARS).write(bars.svg())
+    File(folder / TIMES).write(times.svg())
     return bars, times
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from benchmarks.training import Cell
-from stlc.files import write_atomic
+from stlc.files import File
 from stlc.view import available
 from stlc.view.style import BLUE, GREEN, INK, MUTED, ORANGE, PINK, SKY, Picture, new_figure, picture_style
 
@@ -87,7 +87,7 @@ def draw_results(results: Sequence[Result], known: Mapping[str, KnownFeasible | 
     ]
     picture = draw_benchmarks(panels) if available() else None
     if picture is not None:
-        write_atomic(path, picture.svg())
+        File(path).write(picture.svg())
     return picture is not None
 
 

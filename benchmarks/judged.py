@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from stlc.diagnostics import Diagnostic, StlcError, UsageError
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar.parser import parse
 from stlc.provenance import sha256
 
@@ -78,7 +78,7 @@ def tasks_in(folder: Path) -> tuple[ControlTask, ...]:
 
 def _has_system(path: Path) -> bool:
     try:
-        return parse(read_source(path)).system is not None
+        return parse(File(path).read()).system is not None
     except StlcError:
         return True  # the commands say what is wrong with it
 

@@ -14,7 +14,7 @@ from stlc.controller.problem.task import Task
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.functions import function_files
 from stlc.dynamics.system import System
-from stlc.files import SPECS, alone_in, find_system, read_source, write_atomic
+from stlc.files import File, alone_in
 from stlc.grammar.parser import parse
 from stlc.jsontext import dumps, plain
 from stlc.provenance import git_state, hardware, sha256, versions
@@ -83,7 +83,7 @@ class ResultStore:
         with alone_in(self.folder, wait=True):
             kept = {**self.all(), key.name: plain(document)}
             lines = ",\n".join(f"{dumps(name)}: {dumps(each)}" for name, each in kept.items())
-            write_atomic(self.path, f'{{"format": {dumps(FORMAT)}, "results": {{\n{lines}\n}}}}\n')
+            File(self.path).write(f'{{"format": {dumps(FORMAT)}, "results": {{\n{lines}\n}}}}\n')
         return self.all()[key.name]
 
     def all(self) -> dict[str, dict[str, Any]]:
@@ -121,7 +121,7 @@ def spec_path(benchmark: str) -> Path:
         UsageError: U102, there is no such benchmark.
     """
     name = f"{benchmark}.stl"
-    for path in (folder / part / name for folder in (Path("specs"), SPECS) for part in ("", "families")):
+    for path in (folder / part / name for folder in (Path("specs"), File.SPECS) for part in ("", "families")):
         if path.is_file():
             return path
     raise UsageError(Diagnostic("U102", f"there is no benchmark `{benchmark}`", help=BENCHMARKS))
@@ -134,11 +134,11 @@ def load(benchmark: str, overrides: tuple[tuple[str, str], ...] = ()) -> Task:
 
 @cache
 def _load(_where: Path, path: Path, overrides: tuple[tuple[str, str], ...]) -> Task:
-    spec = parse(read_source(path))
+    spec = parse(File(path).read())
     if spec.system is None:
         raise UsageError(Diagnostic("U101", f"`{path}` names no system"))
     changed = dict(overrides)
-    system = System.load(find_system(spec.system, path), changed)
+    system = System.load(File(spec.system).system(path), changed)
     return Task.of(spec, system, overrides=changed)
 
 

@@ -17,7 +17,7 @@ from benchmarks.options import Output
 from benchmarks.store import Result, made_here
 from stlc.cli.framework.output import Document, emit, say
 from stlc.cli.framework.output import table as columns_of_text
-from stlc.files import write_atomic
+from stlc.files import File
 
 Cell = TypeVar("Cell")
 Row = TypeVar("Row")
@@ -190,7 +190,7 @@ def write_section(page: Path, marker: str, lines: Iterable[str]) -> None:
     tail = rest.partition(end)[2] if found else ""
     before = head if found else head.rstrip("\n") + "\n\n"
     body = "\n".join(lines).strip("\n")
-    write_atomic(page, before + start + body + "\n" + end + tail)
+    File(page).write(before + start + body + "\n" + end + tail)
 
 
 def provenance(results: Iterable[Result], what: str) -> list[str]:

@@ -140,10 +140,10 @@ def load(path: Path | str) -> ast.Spec:
         UsageError: U102, there is no such file.
         SpecError: the text is not a specification; the error carries all diagnostics.
     """
-    from stlc.files import find_spec, read_source
+    from stlc.files import File
     from stlc.grammar.parser import parse as parse_source
 
-    return parse_source(read_source(find_spec(path)))
+    return parse_source(File(File(path).spec()).read())
 
 
 def parse(text: str, name: str = "<text>") -> ast.Spec:

@@ -11,9 +11,10 @@ import stat
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO
+from typing import BinaryIO, ClassVar
 
 from stlc.diagnostics import Diagnostic, MissingError, RunError, SpecError, UsageError, os_reason, usage
 from stlc.escape import operand, shell
@@ -21,93 +22,277 @@ from stlc.registry import closest
 from stlc.source import Source
 from stlc.stopping import leaving
 
-MAX_BYTES = 10_000_000
 RECORD = "run.json"
 """Name of the record of a run; a folder with this file is a run."""
 _INSTALLED = Path(__file__).parent / "library"
 LIBRARY = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[1]
 """Folder of the installed data files, laid out as the source tree (in an editable install, that tree)."""
-SYSTEMS, SPECS = LIBRARY / "examples", LIBRARY / "specs"
-"""Folders of the installed systems and specifications, which refer to each other by `../`."""
-
-SPEC_SUFFIXES = (".stl", ".stlc")
-STDIN = "-"
-"""Name of the standard input, where a file may be one."""
-
+_SPEC_SUFFIXES = (".stl", ".stlc")
 _SYSTEM_SUFFIXES = ("", ".yaml", ".yml")
 _MESH = re.compile(r"\s*(solid\b[^\n]*)\n\s*(facet|endsolid)\b")
+
+
+@dataclass(frozen=True, slots=True)
+class File:
+    """A file as a user names it: by its path, by a name that is looked up, or as `-`, the standard input."""
+
+    MAX_BYTES: ClassVar = 10_000_000
+    """Largest size of a text."""
+    STDIN: ClassVar = "-"
+    SYSTEMS: ClassVar = LIBRARY / "examples"
+    SPECS: ClassVar = LIBRARY / "specs"
+    """Folders of the installed systems and specifications, which refer to each other by `../`."""
+
+    name: Path | str
+
+    # ------------------------------------------------------------------ reading and writing
+
+    def read(self, root: str = "") -> Source:
+        """Read a text file in UTF-8; `-` is the standard input.
+
+        Args:
+            root: folder that names in the text do not leave; see `Source.root`.
+
+        Raises:
+            UsageError: U102, there is no such file, it cannot be opened, or it is a named pipe or a device.
+            SpecError: E003, the file is a 3-D mesh (also `.stl`), another binary file, or not UTF-8; E005, it
+                is larger than `MAX_BYTES`.
+        """
+        name, path = str(self.name), Path(self.name)
+        if name == self.STDIN:
+            return decoded("<stdin>", sys.stdin.buffer.read(self.MAX_BYTES + 1))
+        try:
+            data = read_regular(path, self.MAX_BYTES)
+        except FileNotFoundError:
+            near = closest(path.name, _siblings(path.parent))
+            advice = (f"did you mean `{path.parent / near}`?",) if near else ()
+            raise UsageError.of("U102", f"there is no file `{path}`", help=advice) from None
+        except OSError as error:
+            raise (_too_large(name) if error.errno == errno.EFBIG else unreadable(path, error)) from None
+        except ValueError:  # a zero byte in the name
+            raise UsageError.of("U102", f"no file can be called {name!r}") from None
+        return decoded(name, data, root)
+
+    def opened(self) -> BinaryIO:
+        """Open a regular file, or a pipe that this process has inherited (`/dev/fd/63`), for reading.
+
+        Anything else could wait for ever, or never end.
+
+        Raises:
+            OSError: the path is a folder, a named pipe, a device or a socket, or cannot be opened.
+        """
+        descriptor = os.open(self.name, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+        mode = os.fstat(descriptor).st_mode
+        if stat.S_ISFIFO(mode) and not os.path.lexists(self.real):
+            os.set_blocking(descriptor, True)
+        elif not stat.S_ISREG(mode):
+            os.close(descriptor)
+            raise OSError(errno.EINVAL, f"it is {_noun(mode)}, not a file", str(self.name))
+        return open(descriptor, "rb")  # noqa: PTH123 - of a descriptor
+
+    def require_regular(self) -> None:
+        """Check that it is a regular file, for readers that open it by its path.
+
+        Raises:
+            OSError: it cannot be opened, or is something else; see `opened`.
+        """
+        self.opened().close()
+
+    def write(self, data: bytes | str) -> None:
+        """Write the file atomically: a reader sees the old or the new content, never a part.
+
+        Raises:
+            MissingError: R201, the disk is full, or the user may not write there; the old file is unchanged.
+        """
+        with self.replaced() as temporary:
+            temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+
+    @contextmanager
+    def replaced(self) -> Iterator[Path]:
+        """Context that yields a temporary path; the file there replaces this one if the block succeeds.
+
+        The temporary path has the same suffix. Missing folders are created. A file that is replaced keeps its
+        permissions. A path that is not a regular file (a pipe, `/dev/null`) is written in place.
+
+        Raises:
+            MissingError: R201, the disk is full, or the user may not write there; the old file is unchanged,
+                and the temporary one removed.
+        """
+        path, target = self.name, self.real
+        if target.exists() and not target.is_file() and not target.is_dir():
+            with reported(f"write `{path}`"):
+                yield target
+            return
+        temporary = target.with_name(f".{target.stem}.{os.urandom(4).hex()}{target.suffix}")
+        try:
+            with reported(f"write `{path}`"), leaving(lambda _code: temporary.unlink(missing_ok=True)):
+                target.parent.mkdir(parents=True, exist_ok=True)
+                mode = stat.S_IMODE(target.stat().st_mode) if target.is_file() else None
+                if mode is not None:
+                    temporary.touch(0o600)  # nobody else reads it meanwhile
+                yield temporary
+                with temporary.open("rb+") as file:
+                    os.fsync(file.fileno())
+                if mode is not None:
+                    with suppress(OSError):  # a file system without permissions
+                        temporary.chmod(mode)
+                temporary.replace(target)
+        finally:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+
+    # ------------------------------------------------------------------ finding
+
+    @property
+    def real(self) -> Path:
+        """Absolute path without links; unlike `Path.resolve`, it gives no error at a link back to itself."""
+        return Path(os.path.realpath(self.name))
+
+    def require_folder(self) -> None:
+        """Check, before any work, that it is a folder or can become one.
+
+        Raises:
+            FileExistsError: it is a file.
+        """
+        path = Path(self.name)
+        if path.exists() and not path.is_dir():
+            raise FileExistsError(errno.EEXIST, "it is a file, and a folder is needed", str(path))
+
+    @property
+    def is_spec(self) -> bool:
+        """True if its suffix is that of a specification."""
+        return Path(self.name).suffix in _SPEC_SUFFIXES
+
+    @property
+    def is_pattern(self) -> bool:
+        """True if its name is a pattern (`*`, `?`, `[…]`) and not the path of a file that is called so."""
+        return glob.has_magic(str(self.name)) and not Path(self.name).exists()
+
+    def system(self, spec_path: Path | None = None) -> Path:
+        """Path of the system file of this name.
+
+        The name is tried as a path, then beside the specification, in `systems`, in `examples`, and among the
+        installed files. The suffix `.yaml` may be omitted.
+
+        Raises:
+            UsageError: U102, the file is in none of these places; the message lists them.
+        """
+        folders = [Path()]
+        if spec_path is not None:
+            folders.append(spec_path.parent)
+        folders += [Path("systems"), Path("examples"), self.SYSTEMS, LIBRARY]
+        for folder in folders:
+            for suffix in _SYSTEM_SUFFIXES:
+                path = folder / f"{self.name}{suffix}"
+                if path.is_file():
+                    short = Path(
+                        os.path.normpath(path)
+                    )  # not `specs/../examples/car.yaml`, unless links differ
+                    return short if short.is_file() and short.samefile(path) else path
+        raise UsageError(_no_such("system", str(self.name), folders))
+
+    def spec(self) -> Path:
+        """Path of the specification of this name: a file at that path, else an installed specification.
+
+        An installed specification is found as `specs/traffic.stl` and as `traffic.stl`. A name that is not
+        found is returned unchanged; an attempt to read it then raises the error.
+        """
+        path = Path(self.name)
+        if path.suffix in (".yaml", ".yml"):
+            advice = f"name the specification, and  {shell(('--system', operand(str(path))))}"
+            raise usage(f"`{self.name}` is a system file, not a specification", advice)
+        if path.is_absolute() or ".." in path.parts or path.suffix != ".stl" or path.exists():
+            return path
+        return next((there for folder in (LIBRARY, self.SPECS) if (there := folder / path).is_file()), path)
+
+    @staticmethod
+    def specs(names: Sequence[str]) -> tuple[str, ...]:
+        """Paths of specification files, in order, without duplicates; a folder stands for all files below it.
+
+        Raises:
+            UsageError: U102, a folder contains no specification; U101, `names` is empty.
+        """
+        if not names:
+            raise usage("which file?", "a .stl file, a folder, or - for a pipe")
+        return tuple(dict.fromkeys(path for name in names for path in _specs_below(name)))
+
+    def trace(self, runs: Path = Path("runs")) -> Path:
+        """Path of the trace of this name: a file at that path, else in the newest run below `runs`.
+
+        Raises:
+            UsageError: U102, it is in neither place; the message lists both.
+            RunError: R110, it is in the folder of a run, and a link leads there.
+        """
+        name, folders = str(self.name), [Path(), runs / "latest"]
+        for folder in folders:
+            path = folder / name
+            if path.is_file() or _is_bag(path):
+                return File(path).of_run()
+        if Path(name).is_dir():
+            advice = f"name its traces: '{Path(name) / '*'}'"
+            raise UsageError.of("U102", f"`{name}` is a folder, not a trace", help=(advice,))
+        raise UsageError(_no_such("trace", name, folders))
+
+    def seen(self, runs: Path = Path("runs")) -> Path:
+        """Path of the trace of this name as users see it: relative to the current folder if it is below."""
+        path = self.trace(runs)
+        if path == Path(self.name):
+            return path
+        path = path.resolve()
+        return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+
+    def matches(self) -> list[str]:
+        """Paths of the trace files that match its name, a pattern; `**` stands for any number of folders.
+
+        Hidden files and folders are left out. `**` does not enter links to folders, which may lead back. A
+        folder matches only if it is a trace itself (a ROS 2 bag); files inside it are then left out.
+
+        Raises:
+            UsageError: U102, no file matches.
+        """
+        pattern = str(self.name)
+        parts = [part if part == "**" else re.sub(r"\*\*+", "*", part) for part in Path(pattern).parts]
+        literal = tuple(takewhile(lambda part: not glob.has_magic(part), parts))
+        rest = [*parts[len(literal) :], *(["*"] if parts[-1] == "**" else [])]
+        start = Path(*literal)
+        try:
+            paths = [
+                path for path in start.glob(str(Path(*rest))) if not _hidden(path.relative_to(start), rest)
+            ]
+        except OSError as error:
+            raise UsageError.of("U102", f"cannot look up `{pattern}`: {os_reason(error)}") from None
+        found = {path for path in paths if path.is_file() or _is_bag(path)}
+        bags = {path for path in found if path.is_dir()}
+        names = sorted(str(path) for path in found if bags.isdisjoint(path.parents))
+        if not names:
+            advice = (
+                () if "**" in parts else ("`**` stands for any number of folders, as in 'logs/**/*.csv'",)
+            )
+            raise UsageError.of("U102", f"no file matches `{pattern}`", help=advice)
+        return names
+
+    def of_run(self) -> Path:
+        """Return its path; of a run, `within` it. Raises RunError (R110)."""
+        path = Path(self.name)
+        folder = run_folder(path)
+        return path if folder in (None, path) else within(folder, path.relative_to(folder).as_posix())
+
 
 # ----------------------------------------------------------------------- reading
 
 
-def read_source(path: Path | str, root: str = "") -> Source:
-    """Read a text file in UTF-8; `-` is the standard input.
-
-    Args:
-        path: path of the file.
-        root: folder that names in the text do not leave; see `Source.root`.
-
-    Raises:
-        UsageError: U102, there is no such file, it cannot be opened, or it is a named pipe or a device.
-        SpecError: E003, the file is a 3-D mesh (also `.stl`), another binary file, or not UTF-8; E005, it is
-            larger than `MAX_BYTES`.
-    """
-    name = str(path)
-    if name == STDIN:
-        return decoded("<stdin>", sys.stdin.buffer.read(MAX_BYTES + 1))
-    path = Path(path)
-    try:
-        data = read_regular(path, MAX_BYTES)
-    except FileNotFoundError:
-        near = closest(path.name, _siblings(path.parent))
-        advice = (f"did you mean `{path.parent / near}`?",) if near else ()
-        raise UsageError.of("U102", f"there is no file `{path}`", help=advice) from None
-    except OSError as error:
-        raise (_too_large(name) if error.errno == errno.EFBIG else unreadable(path, error)) from None
-    except ValueError:  # a zero byte in the name
-        raise UsageError.of("U102", f"no file can be called {name!r}") from None
-    return decoded(name, data, root)
-
-
 def read_regular(path: Path, most: int) -> bytes:
-    """Read a file of at most `most` bytes. Raises OSError as `opened_regular` does; EFBIG: it is larger."""
-    with opened_regular(path) as file:
+    """Read a file of at most `most` bytes. Raises OSError as `File.opened` does; EFBIG: it is larger."""
+    with File(path).opened() as file:
         data = file.read(most + 1)
     if len(data) > most:
         raise OSError(errno.EFBIG, f"it is larger than {most // 1_000_000} MB", str(path))
     return data
 
 
-def opened_regular(path: Path) -> BinaryIO:
-    """Open a regular file, or a pipe that this process has inherited (`/dev/fd/63`), for reading.
-
-    Anything else could wait for ever, or never end.
-
-    Raises:
-        OSError: the path is a folder, a named pipe, a device or a socket, or cannot be opened.
-    """
-    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
-    mode = os.fstat(descriptor).st_mode
-    if stat.S_ISFIFO(mode) and not os.path.lexists(real(path)):
-        os.set_blocking(descriptor, True)
-    elif not stat.S_ISREG(mode):
-        os.close(descriptor)
-        raise OSError(errno.EINVAL, f"it is {_noun(mode)}, not a file", str(path))
-    return open(descriptor, "rb")  # noqa: PTH123 - of a descriptor
-
-
 def _noun(mode: int) -> str:
     nouns = {stat.S_IFIFO: "a pipe", stat.S_IFLNK: "a link", stat.S_IFDIR: "a folder", stat.S_IFREG: "a file"}
     return nouns.get(stat.S_IFMT(mode), "a device")
-
-
-def require_regular(path: Path) -> None:
-    """Check that `path` is a regular file, for readers that open it by its name.
-
-    Raises:
-        OSError: it cannot be opened, or is something else; see `opened_regular`.
-    """
-    opened_regular(path).close()
 
 
 def unreadable(path: Path, error: OSError) -> UsageError:
@@ -117,7 +302,7 @@ def unreadable(path: Path, error: OSError) -> UsageError:
 
 
 def _too_large(name: str) -> SpecError:
-    return SpecError.of("E005", f"`{name}` is larger than {MAX_BYTES // 1_000_000} MB")
+    return SpecError.of("E005", f"`{name}` is larger than {File.MAX_BYTES // 1_000_000} MB")
 
 
 def _siblings(folder: Path) -> list[str]:
@@ -127,8 +312,8 @@ def _siblings(folder: Path) -> list[str]:
 
 
 def decoded(name: str, data: bytes, root: str = "") -> Source:
-    """Return the content of a text file as a source. Raises SpecError (E003, E005), as `read_source` does."""
-    if len(data) > MAX_BYTES:
+    """Return the content of a text file as a source. Raises SpecError (E003, E005), as `File.read` does."""
+    if len(data) > File.MAX_BYTES:
         raise _too_large(name)
     if _is_binary_mesh(data):
         raise SpecError(_mesh(name, None))
@@ -182,52 +367,6 @@ def _not_utf8(name: str, data: bytes, error: UnicodeDecodeError) -> Diagnostic:
 # ----------------------------------------------------------------------- writing
 
 
-def write_atomic(path: Path | str, data: bytes | str) -> None:
-    """Write a file atomically: a reader sees the old or the new content, never a part.
-
-    Raises:
-        MissingError: R201, the disk is full, or the user may not write there; the old file is unchanged.
-    """
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data.encode() if isinstance(data, str) else data)
-
-
-@contextmanager
-def atomic_path(path: Path | str) -> Iterator[Path]:
-    """Context that yields a temporary path; the file written there replaces `path` if the block succeeds.
-
-    The temporary path has the same suffix. Missing folders are created. A file that is replaced keeps its
-    permissions. A path that is not a regular file (a pipe, `/dev/null`) is written in place.
-
-    Raises:
-        MissingError: R201, the disk is full, or the user may not write there; the old file is unchanged, and
-            the temporary one removed.
-    """
-    path = Path(path)
-    target = real(path)
-    if target.exists() and not target.is_file() and not target.is_dir():
-        with reported(f"write `{path}`"):
-            yield target
-        return
-    temporary = target.with_name(f".{target.stem}.{os.urandom(4).hex()}{target.suffix}")
-    try:
-        with reported(f"write `{path}`"), leaving(lambda _code: temporary.unlink(missing_ok=True)):
-            target.parent.mkdir(parents=True, exist_ok=True)
-            mode = stat.S_IMODE(target.stat().st_mode) if target.is_file() else None
-            if mode is not None:
-                temporary.touch(0o600)  # nobody else reads it meanwhile
-            yield temporary
-            with temporary.open("rb+") as file:
-                os.fsync(file.fileno())
-            if mode is not None:
-                with suppress(OSError):  # a file system without permissions
-                    temporary.chmod(mode)
-            temporary.replace(target)
-    finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-
-
 @contextmanager
 def reported(action: str) -> Iterator[None]:
     """Context that turns an error of the operating system into MissingError (R201).
@@ -243,145 +382,21 @@ def reported(action: str) -> Iterator[None]:
 # ----------------------------------------------------------------------- finding
 
 
-def real(path: Path) -> Path:
-    """Absolute path without links; unlike `Path.resolve`, it gives no error at a link back to itself."""
-    return Path(os.path.realpath(path))
-
-
-def require_folder(path: Path) -> None:
-    """Check, before any work, that a path is a folder or can become one.
-
-    Raises:
-        FileExistsError: it is a file.
-    """
-    if path.exists() and not path.is_dir():
-        raise FileExistsError(errno.EEXIST, "it is a file, and a folder is needed", str(path))
-
-
-def find_system(name: str, spec_path: Path | None = None) -> Path:
-    """Find the system file called `name` and return its path.
-
-    The name is tried as a path, then beside the specification, in `systems`, in `examples`, and among the
-    installed files. The suffix `.yaml` may be omitted.
-
-    Raises:
-        UsageError: U102, the file is in none of these places; the message lists them.
-    """
-    folders = [Path()]
-    if spec_path is not None:
-        folders.append(spec_path.parent)
-    folders += [Path("systems"), Path("examples"), SYSTEMS, LIBRARY]
-    for folder in folders:
-        for suffix in _SYSTEM_SUFFIXES:
-            path = folder / f"{name}{suffix}"
-            if path.is_file():
-                short = Path(os.path.normpath(path))  # not `specs/../examples/car.yaml`, unless links differ
-                return short if short.is_file() and short.samefile(path) else path
-    raise UsageError(_no_such("system", name, folders))
-
-
-def find_spec(name: Path | str) -> Path:
-    """Find the specification called `name`: a file at that path, else an installed specification.
-
-    An installed specification is found as `specs/traffic.stl` and as `traffic.stl`. A name that is not found
-    is returned unchanged; an attempt to read it then raises the error.
-    """
-    path = Path(name)
-    if path.suffix in (".yaml", ".yml"):
-        advice = f"name the specification, and  {shell(('--system', operand(str(path))))}"
-        raise usage(f"`{name}` is a system file, not a specification", advice)
-    if path.is_absolute() or ".." in path.parts or path.suffix != ".stl" or path.exists():
-        return path
-    return next((there for folder in (LIBRARY, SPECS) if (there := folder / path).is_file()), path)
-
-
-def spec_files(names: Sequence[str]) -> tuple[str, ...]:
-    """Paths of specification files, in order and without duplicates; a folder stands for all files below it.
-
-    Raises:
-        UsageError: U102, a folder contains no specification; U101, `names` is empty.
-    """
-    if not names:
-        raise usage("which file?", "a .stl file, a folder, or - for a pipe")
-    return tuple(dict.fromkeys(path for name in names for path in _specs_below(name)))
-
-
 def _specs_below(name: str) -> Iterator[str]:
     folder = Path(name)
-    if name == STDIN or not folder.is_dir():
+    if name == File.STDIN or not folder.is_dir():
         yield name
         return
     found = sorted(
         path
         for path in folder.rglob("*")
-        if path.suffix in SPEC_SUFFIXES
+        if path.suffix in _SPEC_SUFFIXES
         and path.is_file()
         and not any(part.startswith(".") for part in path.relative_to(folder).parts)  # hidden
     )
     if not found:
         raise UsageError.of("U102", f"there is no specification in `{name}`")
     yield from map(str, found)
-
-
-def find_trace(name: str, runs: Path = Path("runs")) -> Path:
-    """Find the trace called `name`: a file at that path, else in the folder of the newest run below `runs`.
-
-    Raises:
-        UsageError: U102, it is in neither place; the message lists both.
-        RunError: R110, it is in the folder of a run, and a link leads there.
-    """
-    folders = [Path(), runs / "latest"]
-    for folder in folders:
-        path = folder / name
-        if path.is_file() or _is_bag(path):
-            return of_run(path)
-    if Path(name).is_dir():
-        advice = f"name its traces: '{Path(name) / '*'}'"
-        raise UsageError.of("U102", f"`{name}` is a folder, not a trace", help=(advice,))
-    raise UsageError(_no_such("trace", name, folders))
-
-
-def seen_at(name: str, runs: Path = Path("runs")) -> Path:
-    """Return the path of a trace file called `name`.
-
-    It is `name` itself if that file exists, else the file of that name in the newest run below `runs`.
-    """
-    path = find_trace(name, runs)
-    if path == Path(name):
-        return path
-    path = path.resolve()
-    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
-
-
-def has_wildcard(name: str) -> bool:
-    """True if `name` is a pattern (`*`, `?`, `[…]`) and not the path of a file that is called so."""
-    return glob.has_magic(name) and not Path(name).exists()
-
-
-def matching_traces(pattern: str) -> list[str]:
-    """Paths of the trace files that match a pattern, sorted; `**` stands for any number of folders.
-
-    Hidden files and folders are left out. `**` does not enter links to folders, which may lead back. A folder
-    matches only if it is a trace itself (a ROS 2 bag); files inside it are then left out.
-
-    Raises:
-        UsageError: U102, no file matches.
-    """
-    parts = [part if part == "**" else re.sub(r"\*\*+", "*", part) for part in Path(pattern).parts]
-    literal = tuple(takewhile(lambda part: not glob.has_magic(part), parts))
-    rest = [*parts[len(literal) :], *(["*"] if parts[-1] == "**" else [])]
-    start = Path(*literal)
-    try:
-        paths = [path for path in start.glob(str(Path(*rest))) if not _hidden(path.relative_to(start), rest)]
-    except OSError as error:
-        raise UsageError.of("U102", f"cannot look up `{pattern}`: {os_reason(error)}") from None
-    found = {path for path in paths if path.is_file() or _is_bag(path)}
-    bags = {path for path in found if path.is_dir()}
-    names = sorted(str(path) for path in found if bags.isdisjoint(path.parents))
-    if not names:
-        advice = () if "**" in parts else ("`**` stands for any number of folders, as in 'logs/**/*.csv'",)
-        raise UsageError.of("U102", f"no file matches `{pattern}`", help=advice)
-    return names
 
 
 def _hidden(path: Path, pattern: Sequence[str]) -> bool:
@@ -418,7 +433,7 @@ def _no_such(kind: str, name: str, folders: Sequence[Path]) -> Diagnostic:
 
 
 def _shown(path: Path) -> str:
-    return f"installed: {path.name}" if SYSTEMS in path.parents else str(path)
+    return f"installed: {path.name}" if File.SYSTEMS in path.parents else str(path)
 
 
 def named_in(source: Source, name: str, *, copied: bool = False) -> Path:
@@ -480,12 +495,6 @@ def within(root: Path, name: str, most: int | None = None, *, folders: bool = Fa
 def run_folder(path: Path) -> Path | None:
     """Return the nearest folder of a run at or above `path`; None if there is none."""
     return next((folder for folder in (path, *path.parents) if (folder / RECORD).is_file()), None)
-
-
-def of_run(path: Path) -> Path:
-    """Return the path of a file that the user names; of a run, `within` it. Raises RunError (R110)."""
-    folder = run_folder(path)
-    return path if folder in (None, path) else within(folder, path.relative_to(folder).as_posix())
 
 
 def place(root: Path, name: str) -> Path:

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import CodeType, ModuleType
 
 from stlc.diagnostics import RunError
-from stlc.files import MAX_BYTES, read_regular
+from stlc.files import File, read_regular
 from stlc.source import Span
 
 _TEXT = "__stlc_text__"
@@ -67,7 +67,7 @@ def module_at(path: Path, name: str, place: Span | None = None) -> ModuleType:
     require_driving(place)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file `{path}`")
-    text, known = read_regular(path, MAX_BYTES), sys.modules.get(name)
+    text, known = read_regular(path, File.MAX_BYTES), sys.modules.get(name)
     if known is not None and getattr(known, _TEXT, None) == (path, text):
         return known
     if path.suffix != ".py":

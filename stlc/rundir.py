@@ -24,18 +24,16 @@ from typing import Any, ClassVar, Literal
 from stlc.diagnostics import Diagnostic, RunError, StlcError, UsageError, os_reason, usage
 from stlc.escape import file_part, shell
 from stlc.files import (
-    MAX_BYTES,
     RECORD,
+    File,
     alone_in,
     decoded,
-    find_trace,
     place,
     read_regular,
     refused,
     reported,
     run_folder,
     within,
-    write_atomic,
 )
 from stlc.jsontext import data_of, dumps
 from stlc.records import read
@@ -247,7 +245,7 @@ class RunDir:
         """True if something in the folder has this name; reading it can still fail."""
         return os.path.lexists(self.path / name)
 
-    def file(self, name: str, most: int = MAX_BYTES) -> Path:
+    def file(self, name: str, most: int = File.MAX_BYTES) -> Path:
         """Return the path of a file of the run, for a reader that opens it by its path.
 
         Args:
@@ -266,9 +264,9 @@ class RunDir:
 
     def write(self, name: str, data: bytes | str) -> None:
         """Write a file atomically. Raises the errors of `place`, and MissingError (R201) if that fails."""
-        write_atomic(self.place(name), data)
+        File(self.place(name)).write(data)
 
-    def read(self, name: str, most: int = MAX_BYTES) -> bytes:
+    def read(self, name: str, most: int = File.MAX_BYTES) -> bytes:
         """Read a file of the run. Raises the errors of `file`, and RunError (R101) if it cannot be read."""
         try:
             return read_regular(self.file(name, most), most)
@@ -595,7 +593,7 @@ def recorded_trace(what: str, runs: Path) -> Path:
     """
     try:
         if not Path(what).is_dir():
-            return find_trace(what, runs)
+            return File(what).trace(runs)
     except UsageError as missing:
         try:
             folder = RunDir.open(what, runs)

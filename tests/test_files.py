@@ -16,21 +16,7 @@ import pytest
 from stlc import files
 from stlc.cli.framework.render import render_text
 from stlc.diagnostics import MissingError, RunError, SpecError, StlcError, UsageError
-from stlc.files import (
-    MAX_BYTES,
-    atomic_path,
-    find_spec,
-    find_system,
-    find_trace,
-    has_wildcard,
-    matching_traces,
-    named_in,
-    place,
-    read_regular,
-    read_source,
-    within,
-    write_atomic,
-)
+from stlc.files import File, named_in, place, read_regular, within
 from stlc.source import Source
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -48,20 +34,20 @@ def finding(error: pytest.ExceptionInfo[StlcError]):
 def test_a_text_is_read_under_the_name_it_was_given(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("a.stl").write_bytes(b"\xef\xbb\xbfspec a\n# gr\xc3\xb6\xc3\x9fe\n")
-    source = read_source("a.stl")
+    source = File("a.stl").read()
     assert (source.name, source.text) == ("a.stl", "spec a\n# größe\n")
 
 
 def test_the_standard_input_is_a_file_too(monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"spec a")))
-    source = read_source("-")
+    source = File("-").read()
     assert (source.name, source.text) == ("<stdin>", "spec a")
 
 
 def test_a_missing_file(tmp_path):
     (tmp_path / "traffic.stl").touch()
     with pytest.raises(UsageError) as caught:
-        read_source(tmp_path / "trafic.stl")
+        File(tmp_path / "trafic.stl").read()
     assert finding(caught).code == "U102"
     assert finding(caught).help == (f"did you mean `{tmp_path / 'traffic.stl'}`?",)
 
@@ -69,7 +55,7 @@ def test_a_missing_file(tmp_path):
 def test_a_missing_folder_and_a_folder_for_a_file(tmp_path):
     for path in (tmp_path / "no" / "a.stl", tmp_path):
         with pytest.raises(UsageError) as caught:
-            read_source(path)
+            File(path).read()
         assert finding(caught).code == "U102"
 
 
@@ -77,7 +63,7 @@ def test_an_ascii_mesh_is_shown(tmp_path):
     path = tmp_path / "part.stl"
     path.write_text("solid bracket_v2\n  facet normal 0 0 1\n    outer loop\n", encoding="ascii")
     with pytest.raises(SpecError) as caught:
-        read_source(path)
+        File(path).read()
     assert render_text(caught.value.diagnostics, color=False).splitlines() == [
         f"error[E003]: `{path}` is a 3-D mesh, not a specification",
         f" --> {path}:1:1",
@@ -93,7 +79,7 @@ def test_an_ascii_mesh_is_shown(tmp_path):
 def test_a_specification_may_speak_of_solids(tmp_path):
     path = tmp_path / "a.stl"
     path.write_text("# solid ground\nsignal solid\n", encoding="utf-8")
-    assert read_source(path).text.startswith("# solid")
+    assert File(path).read().text.startswith("# solid")
 
 
 @pytest.mark.parametrize(
@@ -109,7 +95,7 @@ def test_what_is_no_text(tmp_path, data, says):
     path = tmp_path / "a.stl"
     path.write_bytes(data)
     with pytest.raises(SpecError) as caught:
-        read_source(path)
+        File(path).read()
     assert finding(caught).code == "E003"
     assert says in finding(caught).message
 
@@ -117,9 +103,9 @@ def test_what_is_no_text(tmp_path, data, says):
 def test_a_large_file_is_not_read(tmp_path):
     path = tmp_path / "a.stl"
     with path.open("wb") as file:
-        file.truncate(MAX_BYTES + 1)
+        file.truncate(File.MAX_BYTES + 1)
     with pytest.raises(SpecError) as caught:
-        read_source(path)
+        File(path).read()
     assert finding(caught).code == "E005"
 
 
@@ -132,9 +118,9 @@ def listed(folder: Path) -> list[str]:
 
 def test_texts_and_bytes_are_written_whole(tmp_path):
     path = tmp_path / "new" / "folder" / "a.json"
-    write_atomic(path, "größe")
+    File(path).write("größe")
     assert path.read_text(encoding="utf-8") == "größe"
-    write_atomic(str(path), b"\x00\x01")
+    File(str(path)).write(b"\x00\x01")
     assert path.read_bytes() == b"\x00\x01"
     assert listed(path.parent) == ["a.json"]
 
@@ -142,7 +128,7 @@ def test_texts_and_bytes_are_written_whole(tmp_path):
 def test_a_file_is_readable_as_the_user_wants_it(tmp_path):
     before = os.umask(0o027)
     try:
-        write_atomic(tmp_path / "a", "x")
+        File(tmp_path / "a").write("x")
     finally:
         os.umask(before)
     assert (tmp_path / "a").stat().st_mode & 0o777 == 0o640
@@ -153,7 +139,7 @@ def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path, mode):
     path = tmp_path / "a"
     path.write_text("old")
     path.chmod(mode)
-    with atomic_path(path) as temporary:
+    with File(path).replaced() as temporary:
         assert temporary.stat().st_mode & 0o077 == 0
         temporary.write_text("new")
     assert path.read_text() == "new"
@@ -161,9 +147,9 @@ def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path, mode):
 
 
 def test_a_link_is_written_through(tmp_path):
-    write_atomic(tmp_path / "real.txt", "old")
+    File(tmp_path / "real.txt").write("old")
     (tmp_path / "link.txt").symlink_to("real.txt")
-    write_atomic(tmp_path / "link.txt", "new")
+    File(tmp_path / "link.txt").write("new")
     assert (tmp_path / "link.txt").is_symlink()
     assert (tmp_path / "real.txt").read_text(encoding="utf-8") == "new"
 
@@ -171,11 +157,11 @@ def test_a_link_is_written_through(tmp_path):
 def test_a_loop_of_links_is_a_diagnostic(tmp_path):
     (tmp_path / "loop").symlink_to("loop")
     with pytest.raises(MissingError, match=r"cannot write .*loop"):
-        write_atomic(tmp_path / "loop" / "file.txt", "new")
+        File(tmp_path / "loop" / "file.txt").write("new")
 
 
 def test_the_temporary_file_has_the_suffix_and_the_folder(tmp_path):
-    with atomic_path(tmp_path / "trace.npz") as temporary:
+    with File(tmp_path / "trace.npz").replaced() as temporary:
         assert (temporary.suffix, temporary.parent) == (".npz", tmp_path)
         temporary.write_bytes(b"1")
         assert not (tmp_path / "trace.npz").exists()
@@ -184,10 +170,10 @@ def test_the_temporary_file_has_the_suffix_and_the_folder(tmp_path):
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
 def test_whatever_happens_the_old_file_survives(tmp_path, error):
-    write_atomic(tmp_path / "a", "old")
+    File(tmp_path / "a").write("old")
 
     def interrupted() -> None:
-        with atomic_path(tmp_path / "a") as temporary:
+        with File(tmp_path / "a").replaced() as temporary:
             temporary.write_text("half", encoding="utf-8")
             raise error
 
@@ -198,14 +184,14 @@ def test_whatever_happens_the_old_file_survives(tmp_path, error):
 
 
 def test_a_full_disk_is_reported_and_leaves_nothing(tmp_path, monkeypatch):
-    write_atomic(tmp_path / "a", "old")
+    File(tmp_path / "a").write("old")
 
     def full(_: int) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(files.os, "fsync", full)
     with pytest.raises(MissingError) as caught:
-        write_atomic(tmp_path / "a", "new")
+        File(tmp_path / "a").write("new")
     assert finding(caught).code == "R201"
     assert finding(caught).message == f"cannot write `{tmp_path / 'a'}`: no space left on device"
     assert caught.value.exit_code == 5
@@ -216,16 +202,16 @@ def test_a_full_disk_is_reported_and_leaves_nothing(tmp_path, monkeypatch):
 @pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full")
 def test_devices_are_written_in_place():
     with pytest.raises(MissingError):
-        write_atomic(FULL, "x" * 100_000)
+        File(FULL).write("x" * 100_000)
     assert FULL.exists()
-    write_atomic(os.devnull, "x")
+    File(os.devnull).write("x")
     assert not Path(os.devnull).is_file()
 
 
 def test_a_folder_is_not_replaced(tmp_path):
     (tmp_path / "a").mkdir()
     with pytest.raises(MissingError) as caught:
-        write_atomic(tmp_path / "a", "x")
+        File(tmp_path / "a").write("x")
     assert finding(caught).code == "R201"
     assert listed(tmp_path) == ["a"]
 
@@ -233,15 +219,15 @@ def test_a_folder_is_not_replaced(tmp_path):
 def test_a_file_in_the_way_of_a_folder(tmp_path):
     (tmp_path / "a").touch()
     with pytest.raises(MissingError):
-        write_atomic(tmp_path / "a" / "b", "x")
+        File(tmp_path / "a" / "b").write("x")
 
 
 def test_a_kill_in_the_middle_of_a_save_leaves_the_old_file(tmp_path):
     path = tmp_path / "state"
-    write_atomic(path, "old")
+    File(path).write("old")
     script = (
-        "import os, signal, sys\nfrom stlc.files import atomic_path\n"
-        "with atomic_path(sys.argv[1]) as temporary:\n"
+        "import os, signal, sys\nfrom stlc.files import File\n"
+        "with File(sys.argv[1]).replaced() as temporary:\n"
         "    temporary.write_text('half')\n    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     done = subprocess.run([sys.executable, "-c", script, str(path)], check=False)
@@ -256,48 +242,48 @@ def test_a_kill_in_the_middle_of_a_save_leaves_the_old_file(tmp_path):
 def project(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("specs/traffic.stl", "examples/car.yaml", "examples/maze.yml", "specs/own.yaml"):
-        write_atomic(name, "")
+        File(name).write("")
     return tmp_path
 
 
 def test_a_system_is_found_as_given_beside_the_spec_and_in_folders_of_systems(project):
     spec = Path("specs/traffic.stl")
-    assert find_system("examples/car.yaml") == Path("examples/car.yaml")
-    assert find_system("own", spec) == Path("specs/own.yaml")
-    assert find_system("car.yaml", spec) == Path("examples/car.yaml")
-    assert find_system("maze") == Path("examples/maze.yml")
-    write_atomic("systems/maze.yaml", "")
-    assert find_system("maze") == Path("systems/maze.yaml")
-    assert find_system("../examples/car.yaml", spec) == Path("examples/car.yaml")
-    assert find_system(str(project / "examples/car.yaml")) == project / "examples/car.yaml"
-    write_atomic("car.yaml", "")
-    assert find_system("car.yaml", spec) == Path("car.yaml")
+    assert File("examples/car.yaml").system() == Path("examples/car.yaml")
+    assert File("own").system(spec) == Path("specs/own.yaml")
+    assert File("car.yaml").system(spec) == Path("examples/car.yaml")
+    assert File("maze").system() == Path("examples/maze.yml")
+    File("systems/maze.yaml").write("")
+    assert File("maze").system() == Path("systems/maze.yaml")
+    assert File("../examples/car.yaml").system(spec) == Path("examples/car.yaml")
+    assert File(str(project / "examples/car.yaml")).system() == project / "examples/car.yaml"
+    File("car.yaml").write("")
+    assert File("car.yaml").system(spec) == Path("car.yaml")
 
 
 @pytest.mark.usefixtures("project")
 def test_an_installed_system_is_found_last(tmp_path, monkeypatch):
     library = tmp_path / "installed"
-    write_atomic(library / "ship.yaml", "")
-    monkeypatch.setattr(files, "SYSTEMS", library)
-    assert find_system("ship") == library / "ship.yaml"
+    File(library / "ship.yaml").write("")
+    monkeypatch.setattr(File, "SYSTEMS", library)
+    assert File("ship").system() == library / "ship.yaml"
 
 
 @pytest.mark.usefixtures("project")
 def test_an_installed_specification_is_found_last(tmp_path, monkeypatch):
     library = tmp_path / "installed"
-    write_atomic(library / "specs/ship.stl", "")
+    File(library / "specs/ship.stl").write("")
     monkeypatch.setattr(files, "LIBRARY", library)
-    monkeypatch.setattr(files, "SPECS", library / "specs")
+    monkeypatch.setattr(File, "SPECS", library / "specs")
     for name in ("ship.stl", "specs/ship.stl", Path("specs/ship.stl")):
-        assert find_spec(name) == library / "specs/ship.stl"
+        assert File(name).spec() == library / "specs/ship.stl"
     for name in ("specs/traffic.stl", "-", "nowhere.stl", "../installed/specs/ship.stl", "a\0b.stl"):
-        assert find_spec(name) == Path(name)
+        assert File(name).spec() == Path(name)
 
 
 @pytest.mark.usefixtures("project")
 def test_a_missing_system_says_where_it_looked():
     with pytest.raises(UsageError) as caught:
-        find_system("cra.yaml", Path("specs/traffic.stl"))
+        File("cra.yaml").system(Path("specs/traffic.stl"))
     told = finding(caught)
     assert (told.code, told.message) == ("U102", "there is no system `cra.yaml`")
     assert told.help == ("did you mean `examples/car.yaml`?",)
@@ -308,20 +294,20 @@ def test_a_missing_system_says_where_it_looked():
 
 @pytest.mark.usefixtures("project")
 def test_a_trace_is_found_as_given_and_then_in_the_newest_run():
-    write_atomic("runs/traffic/0001/trace.npz", "")
+    File("runs/traffic/0001/trace.npz").write("")
     Path("runs/latest").symlink_to("traffic/0001")
-    assert find_trace("trace.npz") == Path("runs/latest/trace.npz")
-    write_atomic("trace.npz", "")
-    assert find_trace("trace.npz") == Path("trace.npz")
+    assert File("trace.npz").trace() == Path("runs/latest/trace.npz")
+    File("trace.npz").write("")
+    assert File("trace.npz").trace() == Path("trace.npz")
     with pytest.raises(UsageError) as caught:
-        find_trace("trase.npz")
+        File("trase.npz").trace()
     assert finding(caught).help == ("did you mean `trace.npz`?",)
     assert finding(caught).note == ("looked at: trase.npz, runs/latest/trase.npz",)
 
 
 def test_a_name_that_no_file_can_have():
     with pytest.raises(UsageError) as caught:
-        read_source("a\0b.stl")
+        File("a\0b.stl").read()
     assert finding(caught).message == r"no file can be called 'a\x00b.stl'"
 
 
@@ -336,19 +322,19 @@ def test_patterns_of_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     for link in ("a/again", "a/b/again"):  # without end, if links were followed
         Path(link).symlink_to(tmp_path / "a")
     deep = ["a/1.csv", "a/b/2.csv", "a/b/c/[4].csv"]
-    assert matching_traces("**/*.csv") == [*deep, "z.csv"]
-    assert matching_traces(f"{tmp_path}/a/**/*.csv") == [f"{tmp_path}/{name}" for name in deep]
-    assert matching_traces("a/**") == [*deep, "a/t.txt"]
-    assert matching_traces("*") == ["bag", "z.csv"]
-    assert matching_traces("**/*.db3") == ["bag/x.db3"]
-    assert matching_traces("a/b/*/[[]4].csv") == ["a/b/c/[4].csv"]
-    assert matching_traces(".h/*.csv") == [".h/x.csv"]
-    assert matching_traces("a**/?.csv") == ["a/1.csv"]
-    assert has_wildcard("a/*.csv")
-    assert not has_wildcard("a/b/c/[4].csv")
+    assert File("**/*.csv").matches() == [*deep, "z.csv"]
+    assert File(f"{tmp_path}/a/**/*.csv").matches() == [f"{tmp_path}/{name}" for name in deep]
+    assert File("a/**").matches() == [*deep, "a/t.txt"]
+    assert File("*").matches() == ["bag", "z.csv"]
+    assert File("**/*.db3").matches() == ["bag/x.db3"]
+    assert File("a/b/*/[[]4].csv").matches() == ["a/b/c/[4].csv"]
+    assert File(".h/*.csv").matches() == [".h/x.csv"]
+    assert File("a**/?.csv").matches() == ["a/1.csv"]
+    assert File("a/*.csv").is_pattern
+    assert not File("a/b/c/[4].csv").is_pattern
     for pattern in ("none/*.csv", "a/**/*.npz"):
         with pytest.raises(UsageError, match="U102: no file matches"):
-            matching_traces(pattern)
+            File(pattern).matches()
 
 
 @pytest.mark.parametrize("codec", ["utf-16", "utf-16-be", "utf-16-le"])
@@ -357,7 +343,7 @@ def test_a_text_in_utf_16_is_told_by_name(tmp_path, codec):
     mark = "" if codec == "utf-16" else "\ufeff"
     path.write_bytes((mark + "signal x\n").encode(codec))
     with pytest.raises(SpecError) as caught:
-        read_source(path)
+        File(path).read()
     assert "is UTF-16" in finding(caught).message
     assert "UTF-8" in finding(caught).help[0]
 
@@ -365,7 +351,7 @@ def test_a_text_in_utf_16_is_told_by_name(tmp_path, codec):
 @pytest.mark.parametrize("name", ["tank.yaml", "my tank.yml", "-x.yaml"])
 def test_a_system_file_is_no_specification(name):
     with pytest.raises(UsageError) as caught:
-        files.find_spec(name)
+        File(name).spec()
     assert "is a system file" in finding(caught).message
     option, word = shlex.split(finding(caught).help[0].partition(", and ")[2])
     assert (option, word) == ("--system", name if not name.startswith("-") else f"./{name}")
@@ -378,13 +364,13 @@ def test_what_could_wait_or_never_end_is_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.stl")
     for name, noun in (("pipe.stl", "a pipe"), ("/dev/zero", "a device"), (".", "a folder")):
         with pytest.raises(UsageError, match=f"cannot read .*it is {noun}"):
-            read_source(tmp_path / name)
+            File(tmp_path / name).read()
     (tmp_path / "main.stl").write_text('import "pipe.stl" as p\nsignal x\nrequire r: x > 0\n')
     from stlc.compile.frontend.modules import library_of
     from stlc.grammar.parser import parse
 
     with pytest.raises(SpecError, match="it is a pipe"):
-        library_of(parse(read_source(tmp_path / "main.stl")))
+        library_of(parse(File(tmp_path / "main.stl").read()))
 
 
 def test_a_pipe_of_the_shell_is_read() -> None:
@@ -392,7 +378,7 @@ def test_a_pipe_of_the_shell_is_read() -> None:
     with os.fdopen(writer, "w") as end:
         end.write("spec piped\n")
     try:
-        assert read_source(f"/dev/fd/{reader}").text == "spec piped\n"
+        assert File(f"/dev/fd/{reader}").read().text == "spec piped\n"
     finally:
         os.close(reader)
 
@@ -432,7 +418,7 @@ def test_nothing_is_written_where_a_link_leads(tmp_path: Path) -> None:
     (root / "eval").symlink_to(outside)
     os.mkfifo(root / "pipe")
     for name in ("report.html", "new", "pipe", "deep/er/file"):
-        write_atomic(place(root, name), "content")
+        File(place(root, name)).write("content")
         assert not (root / name).is_symlink()
         assert (root / name).read_text() == "content"
     with pytest.raises(RunError, match="it is a link"):

@@ -14,7 +14,7 @@ from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import Diagnostic, SpecError
 from stlc.dynamics.load import load_system_decl
-from stlc.files import find_system
+from stlc.files import File
 from stlc.grammar import ast
 from stlc.grammar.format.format import format_text
 from stlc.grammar.parser import parse
@@ -51,7 +51,7 @@ def findings(source: Source, example: Example) -> list[Diagnostic]:
         spec = parse(source)
         grid, interface = Grid(trace().dt, trace().horizon), None
         if spec.system is not None:
-            decl = load_system_decl(find_system(spec.system, Path(source.name)))
+            decl = load_system_decl(File(spec.system).system(Path(source.name)))
             grid, interface = Grid(decl.dt, decl.horizon), decl.interface()
         purpose = "train" if example.for_training or interface is not None else "check"
         return list(compile_spec(spec, grid=grid, interface=interface, purpose=purpose).warnings)

@@ -19,7 +19,7 @@ from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.diagnostics import PluginError, SystemFileError, UsageError
 from stlc.dynamics.load import load_system_decl
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar.parser import parse
 from stlc.plants.declaration import load_plant_decl, plant_schema
 from stlc.plants.kind import KINDS
@@ -59,7 +59,7 @@ output: {total: }
 
 @pytest.fixture
 def car_task() -> Task:
-    return Task.of(parse(read_source(SPEC)), System.load(CAR))
+    return Task.of(parse(File(SPEC).read()), System.load(CAR))
 
 
 @pytest.fixture

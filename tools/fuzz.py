@@ -156,12 +156,12 @@ def _captured(out, noise):
 def _read(limits):
     """Exit code, output and warnings of the library on `a.stl`."""
     from stlc.diagnostics import StlcError
-    from stlc.files import read_source
+    from stlc.files import File
 
     noise = []
     try:
         with _captured(io.StringIO(), noise):
-            return laws(read_source(Path("a.stl")), limits.seconds, one_in=4), "", noise
+            return laws(File(Path("a.stl")).read(), limits.seconds, one_in=4), "", noise
     except StlcError as error:
         return error.exit_code, "", noise
     except BaseException:

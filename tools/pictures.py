@@ -39,7 +39,7 @@ from stlc.controller.sketch import (
     plans,
     tails,
 )
-from stlc.files import write_atomic
+from stlc.files import File
 from stlc.rundir import RunDir
 from stlc.view.animation import Animation, clear_artists, frames_in, save_animation, save_still
 from stlc.view.run_animation import RecordedScene, animation_of, recorded_scene
@@ -127,7 +127,7 @@ def lead(runs: Path, folder: Path, seed: int | None = None) -> Iterator[Path]:
         )
         if len(buffer.getvalue()) <= LEAD_BYTES:
             break
-    write_atomic(path, buffer.getvalue())
+    File(path).write(buffer.getvalue())
     yield path
 
 

@@ -35,7 +35,7 @@ from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.load import load_task
 from stlc.controller.training.budget import clock_of
 from stlc.diagnostics import usage
-from stlc.files import SYSTEMS
+from stlc.files import File
 from stlc.options import parse_seconds
 from stlc.provenance import sha256
 
@@ -213,7 +213,7 @@ def _verified(case: Case, models: Path, seconds: float, store: ResultStore) -> R
         raise usage(
             f"there is no network `{path}`", "git clone https://github.com/JuliaReach/ARCH2023_AINNCS_RE"
         )
-    task = load_task(SYSTEMS / "ainncs" / f"{case.spec}.stl")
+    task = load_task(File.SYSTEMS / "ainncs" / f"{case.spec}.stl")
     values = {**inputs_of(task), "network": sha256(path.read_bytes()), "seconds": seconds}
 
     def compute() -> Result:

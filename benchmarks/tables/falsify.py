@@ -22,7 +22,7 @@ from stlc.assurance.falsify import FALSIFIER_VERSION, ViolationSearch
 from stlc.assurance.model_simulator import ModelSimulator
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
-from stlc.files import SPECS
+from stlc.files import File
 from stlc.options import parse_seeds
 
 SIMULATIONS = 300
@@ -227,7 +227,7 @@ def falsify(
 
 def _searches(case: Case, seeds: Sequence[int], store: ResultStore) -> Result:
     """The searches of a case, stored or carried out now and stored."""
-    simulator = ModelSimulator.load(str(SPECS / "arch" / f"{case.spec}.stl"), None, dict(case.changes))
+    simulator = ModelSimulator.load(str(File.SPECS / "arch" / f"{case.spec}.stl"), None, dict(case.changes))
     values = {
         **inputs_of(simulator.task),
         "changes": dict(case.changes),

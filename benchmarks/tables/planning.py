@@ -27,7 +27,7 @@ from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.program import command
 from stlc.controller.search.planner import PlanBudget, PlanResult, plan, planning_version
 from stlc.diagnostics import StlcError, UsageError
-from stlc.files import find_system
+from stlc.files import File
 from stlc.provenance import sha256
 
 if TYPE_CHECKING:
@@ -250,7 +250,7 @@ def _one(problem: Problem, method: str) -> Solution:
 
 
 def _system(problem: Problem) -> Path:
-    return find_system(f"examples/planning/{problem.spec}.yaml")
+    return File(f"examples/planning/{problem.spec}.yaml").system()
 
 
 def _seeds(problem: Problem) -> range:

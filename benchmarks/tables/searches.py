@@ -24,7 +24,7 @@ from stlc.assurance.falsify import FALSIFIER_VERSION, ViolationSearch
 from stlc.assurance.model_simulator import ModelSimulator
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
-from stlc.files import SPECS
+from stlc.files import File
 from stlc.options import parse_seeds
 
 PROBLEMS = Path(__file__).parent.parent / "problems"
@@ -85,7 +85,7 @@ def problems() -> tuple[Problem, ...]:
     return (
         *own,
         *(
-            Problem(SPECS / "arch" / f"{case.spec}.stl", case.requirement, case.changes, case.instance)
+            Problem(File.SPECS / "arch" / f"{case.spec}.stl", case.requirement, case.changes, case.instance)
             for case in map(cases.__getitem__, ROWS)
         ),
     )

@@ -25,7 +25,7 @@ from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.interval import Intervals
 from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar.parser import parse
 from stlc.monitor.uncertain import Uncertainty
 from stlc.monitor.verdict import Monitor
@@ -130,7 +130,7 @@ def _formula(case: Case, samples: int, traces: int) -> list[Callable[[], object]
 
 def _specification(name: str, samples: int, traces: int) -> list[Callable[[], object]]:
     rng = np.random.default_rng(0)
-    spec = parse(read_source(spec_path(name)))
+    spec = parse(File(spec_path(name)).read())
     monitor = Monitor(spec, system=spec.system)
     columns = monitor.compiled.signature.columns
     signals = {}

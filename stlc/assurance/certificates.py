@@ -22,7 +22,7 @@ from stlc.assurance.draws import CertifiedDraws, ModelDraws, PlantDraws, verify_
 from stlc.assurance.options import CertifyOptions
 from stlc.diagnostics import RunError, notice, usage
 from stlc.escape import file_part
-from stlc.files import find_spec, of_run, read_source, write_atomic
+from stlc.files import File
 from stlc.foreign import driving
 from stlc.jsontext import data_of, dumps, keys_below
 from stlc.options import checked_share, taking
@@ -140,7 +140,7 @@ def certify(run: Run | Path | str | None, options: CertifyOptions) -> Certificat
     with closing(subject), PULSE.doing(subject.doing):
         for progress in campaign(order):
             found = certificate(order, progress)
-            write_atomic(path, dumps(found, indent=2) + "\n")
+            File(path).write(dumps(found, indent=2) + "\n")
             if not progress.done:
                 overall, noun = progress.assessment.overall, progress.assessment.noun
                 low, high = overall.shares.lower, overall.shares.upper
@@ -188,12 +188,12 @@ def _subject(name: str | None, options: CertifyOptions) -> tuple[Subject, Path, 
         judge = PlantJudge.load(name, options.plant, options.overrides)
         for warning in judge.monitor.compiled.warnings:
             notice(warning)
-        drawn = PlantDraws(judge, find_spec(name), require, options.overrides, options.jobs)
+        drawn = PlantDraws(judge, File(name).spec(), require, options.overrides, options.jobs)
     else:
         from stlc.assurance.model_simulator import ModelSimulator
 
         simulator = ModelSimulator.load(name, options.system, options.overrides)
-        drawn = ModelDraws(simulator, find_spec(name), require, options.overrides)
+        drawn = ModelDraws(simulator, File(name).spec(), require, options.overrides)
     record = drawn.record(())
     parts = (file_part(part, empty="certificate") for part in (record.spec, record.system))
     path = DRAWN_FOLDER / f"{'-on-'.join(parts)}.json"
@@ -228,7 +228,7 @@ def _verified(path: Path, name: str | None, options: CertifyOptions) -> Certific
         UsageError: U102, the file does not exist.
         RunError: R108, it is no certificate; R110, it is in the folder of a run, and a link leads there.
     """
-    text = read_source(of_run(path)).text
+    text = File(File(path).of_run()).read().text
     try:
         stored: StoredCertificate = read(StoredCertificate, data_of(text))
         if stored.kind is None:

@@ -18,7 +18,7 @@ from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.frontend.modules import library_of, spec_sha256
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.files import find_spec, find_system, read_source
+from stlc.files import File
 from stlc.grammar.parser import parse
 from stlc.jsontext import Count
 from stlc.monitor.judgement import chosen
@@ -255,7 +255,7 @@ def system_inputs(spec: ast.Spec, system: Path, overrides: Mapping[str, str]) ->
 
     files = function_files(load_system_decl(system, overrides))
     hashes = {f"file {name}": _file_hash(path) for name, path in sorted(files.items())}
-    return {"spec": _spec_hash(spec), "system": sha256(read_source(system).text), **hashes}
+    return {"spec": _spec_hash(spec), "system": sha256(File(system).read().text), **hashes}
 
 
 def _spec_hash(spec: ast.Spec) -> str:
@@ -280,10 +280,10 @@ def verify_draws(stored: StoredCertificate, spec: str | None, system: str | None
         ValueError: its numbers are no counts of drives.
         UsageError, SpecError, SystemFileError: a file is missing or invalid.
     """
-    text = parse(read_source(find_spec(spec or stored.spec_file)))
+    text = parse(File(File(spec or stored.spec_file).spec()).read())
     named = Path(system or stored.system_file)
     if stored.kind == "plant":
         decl = load_plant_decl(named)
         return compared(stored, plant_inputs(text, decl), decl.packages)
-    found = find_system(str(named), Path(text.source.name))
+    found = File(str(named)).system(Path(text.source.name))
     return compared(stored, system_inputs(text, found, stored.conditions.overrides))

@@ -27,7 +27,7 @@ from stlc.assurance.options import FalsifyOptions
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import SpecError, UsageError, usage
 from stlc.escape import file_part
-from stlc.files import SPEC_SUFFIXES, read_source, require_folder, write_atomic
+from stlc.files import File
 from stlc.jsontext import data_of, dumps
 from stlc.monitor.judgement import require_known
 from stlc.options import MOST_SEED, require_no_jobs, taking
@@ -80,7 +80,7 @@ def falsify(
         source = replace(source, name=RunDir.open(name, options.runs).shown)  # `latest` may be another later
     if options.replay is not None:
         return _replayed(source, options.replay)
-    require_folder(options.out)
+    File(options.out).require_folder()
     require_no_jobs(options.cluster, options.jobs)
     simulator = source.load()
     names = simulator.requirements
@@ -118,7 +118,7 @@ class _Source:
     @property
     def model(self) -> bool:
         """True if the target is a specification, rather than a run."""
-        return self.name.endswith(SPEC_SUFFIXES)
+        return File(self.name).is_spec
 
     def load(self) -> _Simulator:
         """Load the simulator; a black box simulates in as many processes as there are jobs.
@@ -216,7 +216,7 @@ def _written(source: _Source, simulator: _Simulator, result: Falsification) -> F
         save_trace(trace, repeated.trace)
         margin = repeated.margin
     stored = StoredCounterexample(name, margin, trace.name, source.settings(), best.point.tolist())
-    write_atomic(path, dumps(stored) + "\n")
+    File(path).write(dumps(stored) + "\n")
     return FalsifiedRequirement(result, str(path), source.command(path), margin)
 
 
@@ -235,7 +235,7 @@ def _failures(failures: Sequence[FailedSimulation], source: _Source) -> list[Fal
             *(finding.time, finding.stderr, dict(finding.point)),
         )
         source.options.out.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, dumps(stored) + "\n")
+        File(path).write(dumps(stored) + "\n")
         records.append(FalsifiedFinding(finding, len(alike), str(path), source.command(path)))
     return records
 
@@ -309,7 +309,7 @@ def _stored(path: Path) -> StoredCounterexample | StoredFinding:
         UsageError: U102, there is no such file; U101, it is not a counterexample.
     """
     try:
-        found = data_of(read_source(path).text)
+        found = data_of(File(path).read().text)
         kind = found.get("format") if isinstance(found, dict) else None
         stored: StoredCounterexample | StoredFinding
         stored = read(StoredFinding if kind == "stlc-finding/1" else StoredCounterexample, found)

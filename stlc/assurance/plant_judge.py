@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.frontend.modules import library_of, spec_sha256
-from stlc.files import find_spec, read_source
+from stlc.files import File
 from stlc.grammar.parser import parse
 from stlc.jsontext import Num
 from stlc.monitor.judgement import Verdict
@@ -170,7 +170,7 @@ class PlantJudge:
             TraceError: E601, E605, the plant lacks a signal that the requirements read, or has another unit.
         """
         found = load_plant(plant)
-        monitor = Monitor(parse(read_source(find_spec(spec))), dt=found.decl.dt, overrides=overrides)
+        monitor = Monitor(parse(File(File(spec).spec()).read()), dt=found.decl.dt, overrides=overrides)
         compiled, signature = monitor.compiled, found.signature
         sample = Trace(
             signature,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from stlc.diagnostics import CODES, usage
-from stlc.files import SPEC_SUFFIXES, STDIN, find_spec, has_wildcard, read_source, seen_at
+from stlc.files import File
 from stlc.grammar import ast
 from stlc.grammar.manual import CodeList, Page, SpecInWords, in_words, read_page
 from stlc.registry import did_you_mean
@@ -73,13 +73,13 @@ def explain(
             advice = did_you_mean(name.upper(), CODES, "stlc explain  lists the codes")
             raise usage(f"there is no code `{name.upper()}`", *advice)
         return page
-    if name == STDIN or Path(name).suffix in SPEC_SUFFIXES:
+    if name == File.STDIN or File(name).is_spec:
         from stlc.grammar.parser import parse
 
-        return in_words(parse(read_source(find_spec(name))), name, require)
+        return in_words(parse(File(File(name).spec()).read()), name, require)
     from stlc.monitor.check import Question, judge
     from stlc.monitor.explain.tree import explanation
 
-    path = seen_at(name if has_wildcard(name) else str(recorded_trace(name, runs)), runs)
+    path = File(name if File(name).is_pattern else str(recorded_trace(name, runs))).seen(runs)
     verdicts = judge(path, Question(require=require, **options))
     return explanation(next((each for each in verdicts if each.causes), verdicts[0]))  # the first violation

@@ -8,7 +8,7 @@ from pathlib import Path
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.sections import read_system
-from stlc.files import read_source
+from stlc.files import File
 from stlc.source import Source
 
 
@@ -25,7 +25,7 @@ def load_system_decl(path: Path | str | Source, overrides: Mapping[str, str] | N
         SpecError: the file is not text.
         SystemFileError: the file is invalid; carries all findings.
     """
-    source = path if isinstance(path, Source) else read_source(path)
+    source = path if isinstance(path, Source) else File(path).read()
     return parse_system(source, Path(source.name), overrides or {})
 
 

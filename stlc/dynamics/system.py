@@ -32,7 +32,7 @@ from stlc.dynamics.model.rollout import Columns, Stepper
 from stlc.dynamics.model.samplers import Drawing, InitialStates, Rows
 from stlc.dynamics.model.step import ModelStep, build_step, commands
 from stlc.dynamics.scenario import truth, under
-from stlc.files import find_system
+from stlc.files import File
 from stlc.source import Source
 from stlc.tabular import html_table
 
@@ -110,11 +110,11 @@ class System:
         *,
         scenario: str | None = None,
     ) -> System:
-        """Load a system file, by path, by name (`stlc.files.find_system`) or as a text; apply a scenario.
+        """Load a system file, by path, by name (`stlc.files.File.system`) or as a text; apply a scenario.
 
         Raises UsageError if it does not exist, SystemFileError if it is invalid.
         """
-        found = path if isinstance(path, Source) else find_system(str(path))
+        found = path if isinstance(path, Source) else File(str(path)).system()
         decl = load_system_decl(found, overrides or {})
         return cls(decl if scenario is None else under(decl, scenario))
 

@@ -28,7 +28,7 @@ from stlc.diagnostics import Diagnostic, Label, SpecError, StlcError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.load import load_system_decl
 from stlc.editor.symbols import Symbol, SymbolNames, names_of
-from stlc.files import find_system
+from stlc.files import File
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
 from stlc.grammar.scan import declaration_starts, lexemes
@@ -143,7 +143,7 @@ class Systems:
 
     def load(self, name: str, spec_path: Path) -> SystemDecl:
         """Load the system that a specification names. Raises StlcError if it is missing or invalid."""
-        path = find_system(name, spec_path)
+        path = File(name).system(spec_path)
         status = path.stat()
         stamp = (status.st_mtime_ns, status.st_size)
         known = self._known.get(path)

@@ -18,7 +18,7 @@ from stlc.compile.backends.c.streams import TABLES, Streams, runtime, streams_of
 from stlc.compile.backends.numbers import Untranslatable
 from stlc.diagnostics import UsageError, usage
 from stlc.escape import c_comment, c_string
-from stlc.files import place, write_atomic
+from stlc.files import File, place
 from stlc.monitor.online.kernel import streamed_rule
 from stlc.monitor.online.online import How, Online
 from stlc.monitor.verdict import Monitor
@@ -89,7 +89,7 @@ def export_monitor(
         raise usage(f"this specification has no form as C: {error}") from error
     texts, size = _texts(online, program, single=single)
     for name, text in texts.items():
-        write_atomic(place(folder, name), text)
+        File(place(folder, name)).write(text)
     return ExportedMonitor(monitor.spec.source.name, "c", folder, tuple(texts), size)
 
 

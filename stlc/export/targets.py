@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from stlc.diagnostics import usage
-from stlc.files import SPEC_SUFFIXES, find_spec
+from stlc.files import File
 from stlc.foreign import driving
 from stlc.options import Option, Options, taking
 from stlc.rundir import RunDir
@@ -62,12 +62,12 @@ def export(what: Run | ast.Spec | Path | str, options: ExportOptions) -> Exporte
     from stlc.grammar import ast
 
     to, out = options.to, options.out
-    is_spec = isinstance(what, ast.Spec) or str(what).endswith(SPEC_SUFFIXES)
+    is_spec = isinstance(what, ast.Spec) or File(str(what)).is_spec
     if to == "c" and is_spec:
         from stlc.export.monitor import export_monitor
         from stlc.monitor.verdict import Monitor
 
-        spec = what if isinstance(what, ast.Spec) else find_spec(str(what))
+        spec = what if isinstance(what, ast.Spec) else File(str(what)).spec()
         monitor = Monitor(spec, options.dt, system=options.system, overrides=options.overrides)
         at: Any = options.at
         if at is not None and at.isdecimal():

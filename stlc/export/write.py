@@ -33,7 +33,7 @@ from stlc.export.verify import (
     previous_plan_agreement,
     same_verdicts,
 )
-from stlc.files import place, write_atomic
+from stlc.files import File, place
 from stlc.jsontext import dumps
 from stlc.runtime.facts import read_facts
 from stlc.runtime.graphs import Graphs
@@ -151,7 +151,7 @@ def export(run: Run, target: Target, folder: Path, precision: Precision = "float
         kept = tuple(name for name in EXAMPLES if name in texts and _differs(folder / name, texts[name]))
         files = tuple(name for name in texts if name not in kept)
         for name in files:
-            write_atomic(place(folder, name), texts[name])
+            File(place(folder, name)).write(texts[name])
     return Exported(run.dir.shown, target, folder, files, found, latency, unchecked, kept, precision)
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from stlc.compile.semantics.tolerance import TOLERANCE, End
 from stlc.diagnostics import usage
-from stlc.files import find_spec, read_source
+from stlc.files import File
 from stlc.source import Source
 
 if TYPE_CHECKING:
@@ -216,7 +216,7 @@ def load(path: Path, question: Question, *, known: Monitor | None = None, planne
 
 def _named(question: Question) -> Monitor | None:
     """Monitor of the specification that a question names; None if it is that of the trace."""
-    return None if question.spec is None else monitor_of(read_source(find_spec(question.spec)), question)
+    return None if question.spec is None else monitor_of(File(File(question.spec).spec()).read(), question)
 
 
 def too_large(path: Path) -> bool:
@@ -358,7 +358,7 @@ def specification(name: str, carried: Carried) -> tuple[Source, str]:
     source = Source(carried.path or f"{carried.name or 'specification'} in {name}", carried.text)
     changed = ", ".join(f"{constant} = {text}" for constant, text in carried.overrides.items())
     note = f"with {changed}, as it was recorded" if changed else ""
-    if carried.path and Path(carried.path).is_file() and read_source(carried.path).text != source.text:
+    if carried.path and Path(carried.path).is_file() and File(carried.path).read().text != source.text:
         since = (
             f"{carried.path} has changed since; judging by the text in {name} "
             f"(--spec {carried.path} takes the new one)"

@@ -15,7 +15,7 @@ from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.traverse import nodes
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import TraceError, UsageError, usage
-from stlc.files import find_system
+from stlc.files import File
 from stlc.grammar import ast
 from stlc.source import Source
 from stlc.trace import Trace, as_fraction
@@ -80,7 +80,7 @@ def given_times(dt: float | Fraction | None, horizon: float | Fraction | None) -
 def _declared(name: str | Source, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[Times, SystemDecl]:
     from stlc.dynamics.load import load_system_decl
 
-    found = name if isinstance(name, Source) else find_system(name, Path(spec.source.name))
+    found = name if isinstance(name, Source) else File(name).system(Path(spec.source.name))
     decl = load_system_decl(found, overrides)
     return Times(decl.dt, decl.dt * decl.horizon), decl
 
@@ -110,7 +110,7 @@ def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:
     if spec.system is None or spec.library is not None:
         return None
     try:
-        find_system(spec.system, Path(spec.source.name))
+        File(spec.system).system(Path(spec.source.name))
     except UsageError:
         return None
     return _declared(spec.system, spec, overrides)[0]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from stlc.diagnostics import Diagnostic, SpecError, SystemFileError, UsageError, usage
-from stlc.files import STDIN, find_spec, find_system, read_source, spec_files, write_atomic
+from stlc.files import File
 from stlc.lint.lint import Selection, Surroundings
 from stlc.lint.lint import fix as repair
 from stlc.lint.lint import lint as lint_text
@@ -82,13 +82,13 @@ def lint(
     from stlc.grammar.parser import parse
 
     given = [files] if isinstance(files, str | Path) else files
-    names = spec_files([str(name) for name in given])
-    if fix and STDIN in names:
+    names = File.specs([str(name) for name in given])
+    if fix and File.STDIN in names:
         raise usage("`--fix` needs files, not the standard input")
     selection, repairs, findings = Selection(tuple(select), tuple(ignore)), 0, list[Diagnostic]()
     for name in names:
         try:
-            source = read_source(name if fix else find_spec(name))
+            source = File(name if fix else File(name).spec()).read()
         except SpecError as error:
             findings += error.diagnostics
             continue
@@ -103,7 +103,7 @@ def lint(
         if fix:
             repaired = repair(source, look)
             if repaired.count:
-                write_atomic(source.name, repaired.source.text)
+                File(source.name).write(repaired.source.text)
             repairs += repaired.count
             source, found = repaired.source, repaired.findings
         else:
@@ -135,6 +135,6 @@ def _surroundings(system: str | None, source: Source) -> Surroundings | None:
     from stlc.compile.pipeline import Purpose
     from stlc.dynamics.load import load_system_decl
 
-    decl = load_system_decl(find_system(system, Path(source.name)))
+    decl = load_system_decl(File(system).system(Path(source.name)))
     purpose: Purpose = "check" if decl.judges_by(Path(source.name)) else "train"
     return Surroundings(decl.interface(), Grid(decl.dt, decl.horizon), purpose)

@@ -26,7 +26,7 @@ from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_resolve
 from stlc.compile.semantics.semantics import Exact, Semantics, semantics_of
 from stlc.compile.semantics.tolerance import TOLERANCE, End
 from stlc.diagnostics import SpecError, TraceError, usage
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
 from stlc.monitor.explain.report import cause_of
@@ -95,7 +95,7 @@ class Monitor:
         if isinstance(spec, Path) or (
             isinstance(spec, str) and spec.endswith(_SUFFIXES) and "\n" not in spec
         ):
-            spec = parse(read_source(spec))
+            spec = parse(File(spec).read())
         self.spec = parse(Source("<text>", spec)) if isinstance(spec, str) else spec
         self._given = given_times(dt, horizon)
         self._overrides = dict(overrides or {})

@@ -37,7 +37,7 @@ from stlc.dynamics.declaration.schema.record import (
 )
 from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Node, Scalar, Sequence, load_yaml
 from stlc.dynamics.declaration.schema.yaml_nodes import Mapping as MappingNode
-from stlc.files import read_source
+from stlc.files import File
 from stlc.plants.kind import KINDS, ControllerLayout, Layout, PlantKind, Port
 from stlc.source import Source, Span
 from stlc.trace.trace import RESERVED
@@ -335,7 +335,7 @@ def load_plant_decl(path: Path | str) -> PlantDecl:
         SpecError: the file is not text.
         SystemFileError: the file is invalid; carries all findings.
     """
-    return parse_plant(read_source(path), Path(path))
+    return parse_plant(File(path).read(), Path(path))
 
 
 def parse_plant(source: Source, path: Path) -> PlantDecl:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError, usage
 from stlc.escape import shell
-from stlc.files import require_regular
+from stlc.files import File
 from stlc.signature import Kind, Signature
 from stlc.tabular import frame
 from stlc.trace.clocks import ClockSetting, clocked
@@ -246,7 +246,7 @@ def read_recording(path: Path, wanted: Wanted = ALL) -> Recording:
         raise unreadable(path, why, advice="give it the suffix of its format")
     if not path.is_dir():
         with opened(path):
-            require_regular(path)
+            File(path).require_regular()
     found: Recording = chosen.function("read")(path, wanted)
     return found
 

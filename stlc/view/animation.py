@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.files import write_atomic
+from stlc.files import File
 from stlc.view.style import PAPER, new_figure, picture_style
 
 if TYPE_CHECKING:
@@ -147,12 +147,12 @@ def save_animation(
     stride = max(1, -(-animation.frames // max_frames))
     milliseconds = max(20, round(1000 * stride * animation.dt / animation.speed))
     pictures = list(frames_in(animation, range(0, animation.frames, stride), DPI))
-    write_atomic(gif, fitting(pictures, milliseconds, max_bytes))
+    File(gif).write(fitting(pictures, milliseconds, max_bytes))
 
 
 def save_still(animation: Animation, path: Path, *, at: int | None = None, dpi: int = FINE * DPI) -> Path:
     """Write instant `at` of `animation` (default: its `moment`) as PNG or WebP to `path`; return `path`."""
-    write_atomic(path, still_bytes(animation, "webp" if path.suffix == ".webp" else "png", at=at, dpi=dpi))
+    File(path).write(still_bytes(animation, "webp" if path.suffix == ".webp" else "png", at=at, dpi=dpi))
     return path
 
 

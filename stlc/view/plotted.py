@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stlc.diagnostics import usage
-from stlc.files import atomic_path, write_atomic
+from stlc.files import File
 from stlc.grammar import ast
 from stlc.monitor.judgement import Verdict
 from stlc.signature import Column, Signature
@@ -149,9 +149,9 @@ def save_picture(picture: Picture, target: Path) -> None:
     """Write a picture as SVG, PNG or PDF, by the suffix of its file."""
     match target.suffix:
         case ".svg":
-            write_atomic(target, picture.svg())
+            File(target).write(picture.svg())
         case ".png":
             picture.save_png(target)
         case _:
-            with picture_style(), atomic_path(target) as beside:
+            with picture_style(), File(target).replaced() as beside:
                 picture.figure.savefig(beside, format="pdf")

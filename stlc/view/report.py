@@ -19,7 +19,7 @@ from stlc.controller.guard.kind import named_guard
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.run.run import Run, folder_of
 from stlc.escape import operand, shell
-from stlc.files import write_atomic
+from stlc.files import File
 from stlc.foreign import driving
 from stlc.rundir import RunDir
 from stlc.version import __version__
@@ -120,7 +120,7 @@ def write_report(run: RunDir) -> Path:
     contents = read_contents(run)
     sections = sections_of(contents)
     path = run.place(REPORT)
-    write_atomic(path, render_report(contents, sections))
+    File(path).write(render_report(contents, sections))
     for part in sections:
         if part.picture is not None:
             part.picture.save_png(run.place(f"{part.anchor}.png"))

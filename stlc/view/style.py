@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from stlc.controller.sketch import SURROUNDINGS_ON_DARK, VIOLATED
 from stlc.escape import lawful
-from stlc.files import atomic_path
+from stlc.files import File
 from stlc.view import require_drawing
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ class Picture:
 
     def save_png(self, path: Path, *, dpi: int = 150) -> Path:
         """Write the figure on a white background to `path` as PNG; return `path`."""
-        with picture_style(), atomic_path(path) as beside:
+        with picture_style(), File(path).replaced() as beside:
             self._lay_out()
             self.figure.savefig(beside, format="png", dpi=dpi, facecolor=PAPER)
         return path

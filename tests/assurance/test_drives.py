@@ -27,7 +27,7 @@ from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.world import ModelWorld, independent_agents
 from stlc.dynamics.system import System
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar.parser import parse
 from stlc.jsontext import plain
 from stlc.registry import METHODS
@@ -40,7 +40,7 @@ SMALL = {"test.steps": "30", "test.agents": "4", "test.world": "null"}
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """An untrained car."""
-    spec = parse(read_source(ROOT / "specs" / "traffic.stl"))
+    spec = parse(File(ROOT / "specs" / "traffic.stl").read())
     task = Task.of(spec, System.load(ROOT / "examples" / "car.yaml", SMALL))
     config = TrainConfig()
     folder = open_folder(task, config, Launch(root=tmp_path_factory.mktemp("runs")))

@@ -7,7 +7,7 @@ import pytest
 from benchmarks.tables.falsify import CASES, _record, _row, side_by_side
 from stlc.assurance.falsify import SearchBudget, ViolationSearch, falsify
 from stlc.assurance.model_simulator import ModelSimulator
-from stlc.files import SPECS
+from stlc.files import File
 
 
 def test_every_case_has_a_name_of_its_own_and_both_instances_are_there():
@@ -19,7 +19,7 @@ def test_every_case_has_a_name_of_its_own_and_both_instances_are_there():
 
 def test_searches_side_by_side_are_those_of_one_seed_alone():
     (case,) = [each for each in CASES if each.name == "NNx, instance 1"]
-    simulator = ModelSimulator.load(str(SPECS / "arch" / f"{case.spec}.stl"), None, dict(case.changes))
+    simulator = ModelSimulator.load(str(File.SPECS / "arch" / f"{case.spec}.stl"), None, dict(case.changes))
     searches = [ViolationSearch(simulator, 0, seed) for seed in (1, 2, 3)]
     side_by_side(simulator, searches, case.most)
     together = [_record(search, seed) for search, seed in zip(searches, (1, 2, 3), strict=True)]

@@ -11,7 +11,7 @@ import pytest
 from stlc.cli.framework.app import main
 from stlc.cli.framework.watch import watch
 from stlc.dynamics.load import load_system_decl
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar.parser import parse
 from stlc.rundir import RunDir
 
@@ -200,7 +200,7 @@ def test_a_new_specification_is_valid(arguments, capsys):
     assert main(["fmt", str(path), "--check"]) == 0
     system = ["--system", arguments[1]] if arguments else []
     assert main(["lint", str(path), "--strict", *system]) == 0, capsys.readouterr().out
-    spec = parse(read_source(path))
+    spec = parse(File(path).read())
     assert spec.name == "parking"
     if arguments:
         decl = load_system_decl(Path("specs") / str(spec.system))

@@ -21,7 +21,7 @@ from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.lower import lower
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import Diagnostic, SpecError, StlcError
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
 from stlc.monitor.explain.report import explain
@@ -59,7 +59,7 @@ def files(tmp_path: Path) -> Path:
 
 
 def typed_of(path: Path) -> typed.Spec:
-    return resolve(parse(read_source(path)), sink=[])
+    return resolve(parse(File(path).read()), sink=[])
 
 
 def findings(path: Path) -> list[Diagnostic]:
@@ -136,7 +136,7 @@ def test_files_import_files_and_each_has_its_own_names(files: Path) -> None:
 
 
 def test_texts_that_are_kept_stand_for_the_files(files: Path) -> None:
-    spec = parse(read_source(files))
+    spec = parse(File(files).read())
     library = library_of(spec)
     assert set(library) == {"../shapes/geo.stl", "@std"}
     assert len({file_of(key) for key in library}) == 2
@@ -149,7 +149,7 @@ def test_texts_that_are_kept_stand_for_the_files(files: Path) -> None:
 
 
 def test_a_trace_carries_what_its_specification_imports(files: Path, tmp_path: Path) -> None:
-    spec = parse(read_source(files))
+    spec = parse(File(files).read())
     compiled = compile_spec(spec, grid=Grid(Fraction(1, 10), 5))
     meta = TraceMeta(spec_name="main", spec_text=MAIN, spec_library=library_of(spec), horizon=5, dt=0.1)
     data = {"x": np.full((1, 6), 0.5), "y": np.full((1, 6), 9.0)}
@@ -217,7 +217,7 @@ def test_a_bare_time_takes_the_unit_of_the_file_that_calls() -> None:
 def test_the_library_documents_every_pattern() -> None:
     from stlc.compile.frontend import modules
 
-    spec = parse(read_source(modules._STD_FILE))
+    spec = parse(File(modules._STD_FILE).read())
     assert all(isinstance(item, ast.Def) and item.doc for item in spec.items)
     assert {item.name for item in spec.items} == set(PATTERNS)
     with pytest.raises(SpecError):

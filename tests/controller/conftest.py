@@ -10,7 +10,7 @@ from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.dynamics.system import System
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar.parser import parse
 from stlc.rundir import RunDir
 
@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 @pytest.fixture(scope="session")
 def car_task() -> Task:
     """`specs/traffic.stl` with `examples/car.yaml`."""
-    spec = parse(read_source(ROOT / "specs" / "traffic.stl"))
+    spec = parse(File(ROOT / "specs" / "traffic.stl").read())
     return Task.of(spec, System.load(ROOT / "examples" / "car.yaml"))
 
 

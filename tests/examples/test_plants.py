@@ -12,7 +12,7 @@ from stlc.cli.framework.app import main
 from stlc.controller.problem.task import Task
 from stlc.dynamics.model.feedback import growth_of
 from stlc.dynamics.system import System
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar.parser import parse
 
 TASKS = Path(__file__).parents[2] / "examples" / "tasks"
@@ -20,7 +20,7 @@ PLANTS = ("cart_pole", "quadrotor_rates", "quadrotor_rotors", "thermostat", "wat
 
 
 def task(name: str) -> Task:
-    return Task.of(parse(read_source(TASKS / f"{name}.stl")), System.load(TASKS / f"{name}.yaml"))
+    return Task.of(parse(File(TASKS / f"{name}.stl").read()), System.load(TASKS / f"{name}.yaml"))
 
 
 @pytest.mark.parametrize("name", PLANTS)

@@ -18,7 +18,7 @@ from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
 from stlc.controller.run.run import Run
 from stlc.dynamics.system import System
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar.parser import parse
 from stlc.lint.lint import lint
 from stlc.monitor.verdict import Monitor
@@ -34,7 +34,7 @@ DRIVES, ENOUGH, AGREEMENT = 200, 0.95, 0.05
 
 
 def task(name: str) -> Task:
-    return Task.of(parse(read_source(TASKS / f"{name}.stl")), System.load(TASKS / f"{name}.yaml"))
+    return Task.of(parse(File(TASKS / f"{name}.stl").read()), System.load(TASKS / f"{name}.yaml"))
 
 
 def test_every_task_has_a_system_a_plan_and_a_row() -> None:
@@ -47,7 +47,7 @@ def test_every_task_has_a_system_a_plan_and_a_row() -> None:
 def test_a_task_compiles_and_nothing_is_to_be_said(name: str) -> None:
     found = task(name)
     assert found.compiled.timers
-    assert not lint(read_source(TASKS / f"{name}.stl"))
+    assert not lint(File(TASKS / f"{name}.stl").read())
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -60,7 +60,7 @@ def test_a_known_plan_satisfies_the_task(name: str) -> None:
     low, high = found.system.control_low - 1e-6, found.system.control_high + 1e-6
     assert bool(((controls >= low) & (controls <= high)).all())
     path = found.rollout(x0[None], controls[None])[0].numpy()
-    spec = parse(read_source(TASKS / f"{name}.stl"))
+    spec = parse(File(TASKS / f"{name}.stl").read())
     horizon = Fraction(found.system.decl.horizon) * found.system.decl.dt
     monitor = Monitor(spec, dt=found.system.decl.dt, horizon=horizon)
     driven = {column: values[None] for column, values in zip(found.system.names, path.T, strict=True)}

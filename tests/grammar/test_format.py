@@ -11,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from stlc.diagnostics import SpecError
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar.format.format import WIDTH, format_text
 from stlc.grammar.parser import parse
 from stlc.grammar.printer import show
@@ -97,7 +97,7 @@ RULE = "@safety\n@weight(2)\nrequire r: always[0, 5 s] (x > 0 and not y)\n"
 
 @pytest.mark.parametrize("path", DATA, ids=lambda path: path.stem)
 def test_the_benchmarks_keep_what_they_say(path):
-    hold(read_source(path).text)
+    hold(File(path).read().text)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stlc.diagnostics import Diagnostic, SpecError
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar import ast
 from stlc.grammar.fold import LONG_CHAIN, MAX_DEPTH
 from stlc.grammar.parser import MAX_LEXEMES, MAX_TEXT, parse, parse_expr
@@ -61,13 +61,13 @@ TEXTS = [path.read_text(encoding="utf-8") for path in DATA]
 
 @pytest.mark.parametrize("path", DATA, ids=lambda path: path.stem)
 def test_the_six_benchmarks_parse(path):
-    spec = parse(read_source(path))
+    spec = parse(File(path).read())
     assert spec.name == path.stem
     assert any(isinstance(item, ast.Require) for item in spec.items)
 
 
 def test_the_traffic_spec_is_what_it_says():
-    spec = parse(read_source(ROOT / "specs" / "traffic.stl"))
+    spec = parse(File(ROOT / "specs" / "traffic.stl").read())
     assert (spec.name, spec.system, spec.time_unit) == ("traffic", "../examples/car.yaml", "")
     assert spec.system_span is not None
     assert spec.system_span.text == '"../examples/car.yaml"'

@@ -9,7 +9,7 @@ import pytest
 from helpers.strategies import SPAN, declarations, expressions, specs
 from hypothesis import given, settings
 
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar import ast
 from stlc.grammar.parser import parse, parse_expr
 from stlc.grammar.printer import show
@@ -42,7 +42,7 @@ def test_a_specification_reads_back(tree):
 
 @pytest.mark.parametrize("path", DATA, ids=lambda path: path.stem)
 def test_the_benchmarks_read_back(path):
-    spec = parse(read_source(path))
+    spec = parse(File(path).read())
     text = show(spec)
     assert parse(Source("text", text)) == spec
     assert show(parse(Source("text", text))) == text

@@ -10,7 +10,7 @@ import torch
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import Task
 from stlc.dynamics.system import System
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar.parser import parse
 from stlc.source import Source
 
@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 @cache
 def task_of(spec: str, system: str) -> Task:
     files = ROOT / "specs" / f"{spec}.stl", ROOT / "examples" / f"{system}.yaml"
-    return Task.of(parse(read_source(files[0])), System.load(files[1]))
+    return Task.of(parse(File(files[0]).read()), System.load(files[1]))
 
 
 def half_seen_task(folder: Path) -> Task:

@@ -10,7 +10,7 @@ import pytest
 from stlc.compile.ir.discretize import Grid
 from stlc.diagnostics import UsageError
 from stlc.dynamics.load import load_system_decl
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar.format.format import format_text
 from stlc.grammar.parser import parse
 from stlc.lint.lint import Selection, Surroundings, edited, fix, lint
@@ -26,7 +26,7 @@ def codes(text: str, **options) -> list[str]:
 
 
 def test_the_flagship_has_nothing_to_say():
-    source = read_source(ROOT / "specs/traffic.stl")
+    source = File(ROOT / "specs/traffic.stl").read()
     decl = load_system_decl(ROOT / "examples/car.yaml")
     within = Surroundings(decl.interface(), Grid(decl.dt, decl.horizon))
     assert lint(source) == ()

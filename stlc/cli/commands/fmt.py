@@ -14,7 +14,7 @@ from stlc.cli.framework.options import JsonOption, SpecsArgument
 from stlc.cli.framework.output import Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, SpecError
-from stlc.files import STDIN, read_source, spec_files, write_atomic
+from stlc.files import File
 
 DIFFERS, INVALID = 1, 3
 
@@ -58,22 +58,22 @@ def fmt(
     """
     from stlc.grammar.format.format import format_text
 
-    names = spec_files(files or ["."])
+    names = File.specs(files or ["."])
     findings: list[Diagnostic] = []
     results = []
     for name in names:
         try:
-            source = read_source(name)
+            source = File(name).read()
             results.append(_Formatted(name, source.text, format_text(source)))
         except SpecError as error:
             findings += error.diagnostics
     changed = [result for result in results if result.before != result.after]
     dry = check or diff
     for result in () if dry else results:
-        if result.name == STDIN:
+        if result.name == File.STDIN:
             sys.stdout.write("" if json else result.after)
         elif result in changed:
-            write_atomic(result.name, result.after)
+            File(result.name).write(result.after)
 
     text = "".join(map(_diff, changed)) if diff else None
     record = FormattedFiles(names, [result.name for result in changed], not dry, text)
@@ -90,7 +90,7 @@ def _tell(record: FormattedFiles, alike: int) -> None:
     if record.diff:
         emit(record.diff.rstrip("\n"))
     for name in record.changed:
-        if name != STDIN:
+        if name != File.STDIN:
             say(f"{'changed' if record.written else 'would change'} {name}")
     if alike:
         say(f"{alike} {'file' if alike == 1 else 'files'} left as {'it is' if alike == 1 else 'they are'}")

@@ -15,7 +15,7 @@ from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.escape import operand, shell, visible
-from stlc.files import SPECS, SYSTEMS, write_atomic
+from stlc.files import File
 from stlc.registry import did_you_mean
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def init(
         following = here + _following(files)
     _require_new(files, force=force)
     for path, text in files.items():
-        write_atomic(path, text)
+        File(path).write(text)
     if spec is None and system is None:
         for name in ("specs", "systems"):
             (folder / name).mkdir(parents=True, exist_ok=True)
@@ -163,13 +163,17 @@ def _example_files(name: str) -> dict[str, str]:
         advice, note = did_you_mean(name, examples()), (f"there are {', '.join(examples())}",)
         raise UsageError.of("U101", f"there is no example `{name}`", help=advice, note=note)
     files: dict[str, str] = {}
-    judges = [SPECS / judge for _, system in _pairs(specs) for judge in _JUDGE.findall(_installed(system))]
+    judges = [
+        File.SPECS / judge for _, system in _pairs(specs) for judge in _JUDGE.findall(_installed(system))
+    ]
     for path in dict.fromkeys((*specs, *judges)):
         text = path.read_text(encoding="utf-8")
         system = next(found[2] for found in _SYSTEM.finditer(text))
         files[f"specs/{path.name}"] = _SYSTEM.sub(r'\1../systems/\2"', text)
         beside = [
-            word for word in dict.fromkeys(_BESIDE.findall(_installed(system))) if (SYSTEMS / word).is_file()
+            word
+            for word in dict.fromkeys(_BESIDE.findall(_installed(system)))
+            if (File.SYSTEMS / word).is_file()
         ]
         files |= {f"systems/{file}": _installed(file) for file in (system, *beside)}
     return files
@@ -181,14 +185,14 @@ def _pairs(specs: Iterable[Path] | None = None) -> Iterator[tuple[Path, str]]:
     The specifications are `specs`, or by default all installed ones. A specification that refers to no
     installed system file is skipped.
     """
-    for path in sorted(SPECS.glob("*.stl")) if specs is None else specs:
+    for path in sorted(File.SPECS.glob("*.stl")) if specs is None else specs:
         named = _SYSTEM.search(path.read_text(encoding="utf-8"))
-        if named and (SYSTEMS / named[2]).is_file():
+        if named and (File.SYSTEMS / named[2]).is_file():
             yield path, named[2]
 
 
 def _installed(name: str) -> str:
-    return (SYSTEMS / name).read_text(encoding="utf-8")
+    return (File.SYSTEMS / name).read_text(encoding="utf-8")
 
 
 def _template(name: str) -> str:
@@ -212,9 +216,9 @@ def _specification(folder: Path, name: str, from_: str | None) -> tuple[dict[Pat
     path, decl, reference = _path(folder, name, "specs", ".stl"), None, ""
     if from_ is not None:
         from stlc.dynamics.load import load_system_decl
-        from stlc.files import find_system
+        from stlc.files import File
 
-        decl = load_system_decl(find_system(from_))
+        decl = load_system_decl(File(from_).system())
         reference = Path(os.path.relpath(decl.path, path.parent)).as_posix()
     text = format_text(Source(str(path), _spec_text(path.stem, decl, reference)))
     return {path: text}, shell(("stlc", "lint", operand(str(path))))

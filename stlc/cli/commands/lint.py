@@ -14,7 +14,7 @@ from stlc.cli.framework.output import Answer, Document, emit, say, wants_color
 from stlc.cli.framework.program import command
 from stlc.diagnostics import CODES, Diagnostic, usage
 from stlc.escape import sarif_message, uri, workflow_data, workflow_property
-from stlc.files import STDIN, spec_files
+from stlc.files import File
 from stlc.options import Options
 from stlc.source import Span
 from stlc.version import __version__
@@ -62,8 +62,8 @@ def lint(
     """
     from stlc.monitor.linted import lint as lint_files
 
-    names = spec_files(files or ["."])
-    if watch and STDIN in names:
+    names = File.specs(files or ["."])
+    if watch and File.STDIN in names:
         raise usage("`--watch` needs files, not the standard input")
 
     def linted() -> Answer[Lint]:

@@ -110,9 +110,9 @@ def _counted(count: int, what: str) -> str:
 
 def _load(name: str, overrides: Mapping[str, str]) -> SystemDecl:
     from stlc.dynamics.load import load_system_decl
-    from stlc.files import find_system
+    from stlc.files import File
 
-    return load_system_decl(find_system(name), overrides)
+    return load_system_decl(File(name).system(), overrides)
 
 
 def _roll_out(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]:
@@ -143,10 +143,10 @@ def _all_systems() -> Iterator[ListedSystem]:
     from stlc.diagnostics import StlcError
     from stlc.dynamics.facts import ListedSystem
     from stlc.dynamics.load import load_system_decl
-    from stlc.files import SYSTEMS
+    from stlc.files import File
 
     seen: set[str] = set()
-    for folder in (Path("systems"), Path("examples"), SYSTEMS):
+    for folder in (Path("systems"), Path("examples"), File.SYSTEMS):
         for path in sorted([*folder.glob("*.yaml"), *folder.glob("*.yml")]):
             if path.name in seen:
                 continue

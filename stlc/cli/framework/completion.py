@@ -10,7 +10,7 @@ from pathlib import Path
 import typer
 
 from stlc.escape import shell
-from stlc.files import read_source
+from stlc.files import File
 
 _REQUIRE = re.compile(r"\brequire\s+(`[^`\n]+`|[^\W\d]\w*)\s*:")
 _COMMENT = re.compile(r"(#|//).*")
@@ -67,9 +67,8 @@ def _named(context: typer.Context) -> Iterator[Path]:
 
 def _specification(path: Path) -> str:
     """The text of a specification file, or of the specification stored in a trace."""
-    if path.suffix in (".stl", ".stlc"):
-        return read_source(path).text
-    from stlc.files import find_trace
+    if File(path).is_spec:
+        return File(path).read().text
     from stlc.trace import read_recording
 
-    return read_recording(find_trace(str(path))).meta.carried.text
+    return read_recording(File(str(path)).trace()).meta.carried.text

@@ -11,7 +11,7 @@ import typer
 
 from stlc.cli.framework.completion import run_names
 from stlc.diagnostics import usage
-from stlc.files import STDIN, real
+from stlc.files import File
 
 if TYPE_CHECKING:
     pass
@@ -66,10 +66,10 @@ def require_separate(
 
 def _identity(path: Path | str | None) -> object:
     """Key of a file, equal for all its paths; None for no file, such as a folder, a device or `-`."""
-    if path is None or str(path) == STDIN:
+    if path is None or str(path) == File.STDIN:
         return None
     try:
-        target = real(Path(path))
+        target = File(Path(path)).real
         found = target.stat()
     except FileNotFoundError:
         return target

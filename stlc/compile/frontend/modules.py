@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stlc.diagnostics import Diagnostic, SpecError, UsageError
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
 from stlc.jsontext import dumps
@@ -164,11 +164,11 @@ class _Loader:
         if self.library is not None and key in self.library:
             return Source(f"lib/{file_of(key)}", self.library[key])
         if key == STD:
-            return read_source(_STD_FILE)
+            return File(_STD_FILE).read()
         if self.library is not None:
             raise _refused(written, f"the text of `{written.target}` was not stored with this specification")
         try:
-            return read_source(self.home / key)
+            return File(self.home / key).read()
         except UsageError as error:
             first = error.diagnostics[0]
             raise _refused(written, first.message, *first.help) from None

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
-from stlc.files import read_source
+from stlc.files import File
 from stlc.source import Source, Span
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ def _defined_at(world: object, method: str) -> Span | None:
 def _line(file: str, number: int) -> Span | None:
     """Location of line `number` of a file, without surrounding blanks; None if the line cannot be read."""
     try:
-        text = read_source(Path(file)).text
+        text = File(Path(file)).read().text
     except StlcError:
         return None
     near = os.path.relpath(file)

@@ -12,7 +12,7 @@ import torch
 
 from stlc.controller.evaluation.executed import model_consistent
 from stlc.controller.search.plan_traces import meta_of, trace_along
-from stlc.files import atomic_path
+from stlc.files import File
 from stlc.rundir import RunDir
 from stlc.trace import Trace, save_trace
 
@@ -119,5 +119,5 @@ def save_scene(path: Path, scene: Mapping[str, NDArray[Any]]) -> None:
         MissingError: R201, the file cannot be written.
         ValueError: an array contains Python objects.
     """
-    with atomic_path(path) as temporary:
+    with File(path).replaced() as temporary:
         np.savez_compressed(temporary, allow_pickle=False, **scene)

@@ -16,7 +16,7 @@ from stlc.controller.problem.task import Task
 from stlc.controller.run.config import HELD_OUT, HELD_OUT_SEED
 from stlc.controller.search.feasibility import solve
 from stlc.controller.search.planner import PlanBudget, plan
-from stlc.files import write_atomic
+from stlc.files import File
 from stlc.native import Stop, never
 
 if TYPE_CHECKING:
@@ -206,4 +206,4 @@ def save_states(path: Path, task: Task, result: Score) -> None:
         searched=result.searched.numpy(),
         meta=np.array(json.dumps(meta)),
     )
-    write_atomic(path, buffer.getvalue())
+    File(path).write(buffer.getvalue())

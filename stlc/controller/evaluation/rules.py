@@ -21,7 +21,7 @@ from stlc.controller.evaluation.causes import Cause, Lost, losses
 from stlc.controller.evaluation.executed import MOST_TIMED
 from stlc.controller.run.run import INDEX, read_library, save_library
 from stlc.diagnostics import Diagnostic, SystemFileError, UsageError
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
 from stlc.jsontext import Count
@@ -152,7 +152,7 @@ def read_rules(judge: JudgeRef) -> ast.Spec:
         SpecError: the file is not a valid specification.
     """
     try:
-        spec = parse(read_source(judge.path, judge.span.source.root))
+        spec = parse(File(judge.path).read(judge.span.source.root))
     except UsageError as error:
         first = error.diagnostics[0]
         advice = (*first.help, "`--set test.judge=null` does without")

@@ -21,7 +21,7 @@ from typing import Any
 
 from stlc.controller.parallel.workers import CallFiles
 from stlc.diagnostics import MissingError
-from stlc.files import within, write_atomic
+from stlc.files import File, within
 from stlc.version import __version__
 
 
@@ -167,7 +167,7 @@ class RemoteValue:
             help_ = ("install the same version on every machine",)
             raise MissingError.of("R406", self.refused, help=help_)
         for path, data in (self.outputs or {}).items():
-            write_atomic(path, data)
+            File(path).write(data)
         return self.value
 
 

@@ -18,7 +18,7 @@ from stlc.controller.parallel.elsewhere import RemoteValue, absolute
 from stlc.controller.parallel.jobs import Job, JobResult, start
 from stlc.controller.parallel.ray_cluster import RayWorkers
 from stlc.controller.parallel.workers import CallFiles, LostCall
-from stlc.files import RECORD, atomic_path
+from stlc.files import RECORD, File
 from stlc.rundir import RunDir
 
 LOST = -9
@@ -93,7 +93,7 @@ def _probes(jobs: Sequence[Job]) -> Iterator[Mapping[Path, Path]]:
     try:
         for folder in dict.fromkeys(map(_runs, jobs)):
             probes[folder] = folder / f".probe-{secrets.token_hex(8)}"
-            with atomic_path(probes[folder]) as written:
+            with File(probes[folder]).replaced() as written:
                 written.touch()
         yield probes
     finally:

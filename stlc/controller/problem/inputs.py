@@ -10,7 +10,7 @@ from stlc.compile.frontend.modules import Module, load_modules
 from stlc.diagnostics import StlcError
 from stlc.dynamics.functions import function_files
 from stlc.dynamics.load import load_system_decl
-from stlc.files import find_spec, find_system, read_source
+from stlc.files import File
 from stlc.grammar.parser import parse
 
 
@@ -26,20 +26,20 @@ def input_files(
         system: system file that replaces the one named by the specification.
         overrides: values of `--set`.
     """
-    path = find_spec(path)
+    path = File(path).spec()
     found: dict[Path, None] = {path: None}
     with suppress(StlcError):
-        spec = parse(read_source(path))
+        spec = parse(File(path).read())
         found.update(dict.fromkeys(_imported(load_modules(spec))))
         if (wanted := system or spec.system) is not None:
-            there = find_system(wanted, path)
+            there = File(wanted).system(path)
             found[there] = None
             decl = load_system_decl(there, overrides or {})
             found.update(dict.fromkeys(function_files(decl).values()))
             found.update(dict.fromkeys(world.path for world in decl.worlds))
             for judge in decl.judges:
                 found[judge.path] = None
-                found.update(dict.fromkeys(_imported(load_modules(parse(read_source(judge.path))))))
+                found.update(dict.fromkeys(_imported(load_modules(parse(File(judge.path).read())))))
     return tuple(file for file in found if file.is_file())
 
 

@@ -9,7 +9,7 @@ from stlc.controller.problem.task import Task
 from stlc.diagnostics import usage
 from stlc.dynamics.scenario import scenario_constants
 from stlc.dynamics.system import System
-from stlc.files import find_spec, find_system, read_source
+from stlc.files import File
 from stlc.grammar.parser import parse
 
 if TYPE_CHECKING:
@@ -45,8 +45,8 @@ def load_task(
     """Load a specification and a system, and compile the specification for the system.
 
     Args:
-        spec: specification file, searched by `find_spec`.
-        system: system file, which `find_system` looks for; by default the one that the specification names.
+        spec: specification file, searched by `File.spec`.
+        system: system file, which `File.system` looks for; by default the one that the specification names.
         overrides: constants of the specification and keys of the system file to change, name -> text.
         hint: what the user may do if no system is named.
         found: function that receives the path of the system file before it is read.
@@ -58,12 +58,12 @@ def load_task(
         SpecError: the specification is invalid or does not fit the system.
         SystemFileError: the system file is invalid.
     """
-    path = find_spec(Path(spec))
-    parsed = parse(read_source(path))
+    path = File(Path(spec)).spec()
+    parsed = parse(File(path).read())
     wanted = system if system is not None else parsed.system
     if wanted is None:
         raise usage(f"`{path}` names no system", hint, 'or a line `system "FILE"` in the specification')
-    there = find_system(str(wanted), path)
+    there = File(str(wanted)).system(path)
     if found is not None:
         found(there)
     changed = dict(overrides or {})

@@ -27,7 +27,7 @@ from stlc.dynamics.declaration.motion import Assign, JumpDecl
 from stlc.dynamics.declaration.schema.names import ControlDecl
 from stlc.dynamics.declaration.tables import TableDecl
 from stlc.escape import visible
-from stlc.files import real
+from stlc.files import File
 from stlc.signature import Column, Signature
 from stlc.source import Source, Span
 from stlc.units import Unit, time_text
@@ -171,7 +171,7 @@ class SystemDecl:
 
         A specification that judges closed-loop runs is compiled for recorded traces, not for plans.
         """
-        return any(real(judge.path) == real(spec) for judge in self.judges)
+        return any(File(judge.path).real == File(spec).real for judge in self.judges)
 
     @property
     def grid(self) -> Grid:

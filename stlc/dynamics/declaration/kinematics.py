@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import Assignments
-from stlc.files import MAX_BYTES, read_regular
+from stlc.files import File, read_regular
 
 Doubles: TypeAlias = NDArray[np.float64]
 Kind: TypeAlias = Literal["revolute", "prismatic", "fixed"]
@@ -80,7 +80,7 @@ def chain(text: str, tip: str, base: str | None = None) -> tuple[Joint, ...]:
 
 def read_urdf(path: Path) -> str:
     """Return the text of a URDF file. Raises OSError (also: it is too large), or ValueError if not UTF-8."""
-    return read_regular(path, MAX_BYTES).decode("utf-8")
+    return read_regular(path, File.MAX_BYTES).decode("utf-8")
 
 
 def robot_of(text: str) -> ElementTree.Element:

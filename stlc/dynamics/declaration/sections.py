@@ -80,7 +80,7 @@ from stlc.dynamics.declaration.schema.yaml_nodes import (
     load_yaml,
 )
 from stlc.dynamics.declaration.tables import TableDecl, TableKeys, read_tables
-from stlc.files import named_in, read_source, real
+from stlc.files import File, named_in
 from stlc.signature import Signature
 from stlc.source import Source
 
@@ -355,21 +355,21 @@ def extended(root: Mapping, reader: Reader) -> tuple[Mapping, tuple[Source, ...]
     source location. S209 is reported if a file cannot be read or extends itself.
     """
     sources: list[Source] = []
-    seen = {real(Path(reader.source.name))}
+    seen = {File(Path(reader.source.name)).real}
     chain = [root]
     while (node := chain[-1].get(_EXTENDS)) is not None:
         text = reader.text(node, f"`{_EXTENDS}`")
         if text is None:
             break
         path = named_in(node.span.source, text, copied=True)
-        again = real(path) in seen
+        again = File(path).real in seen
         if again or len(chain) > MAX_FILES:
             why = "leads back to itself" if again else f"goes through more than {MAX_FILES} files"
             reader.report("S209", f"`{_EXTENDS}: {text}` {why}", node.span, label="named here")
             break
-        seen.add(real(path))
+        seen.add(File(path).real)
         try:
-            source = read_source(path, node.span.source.root)
+            source = File(path).read(node.span.source.root)
             chain.append(load_yaml(source, sink=reader.findings))
         except StlcError as error:
             reader.report("S209", f"`{text}` cannot be read", node.span, error.diagnostics[0].message)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.escape import spreadsheet
-from stlc.files import write_atomic
+from stlc.files import File
 from stlc.source import Span
 from stlc.trace.formats.cells import Array, bare, is_missing, number_of, numbers, read_lines
 from stlc.trace.formats.layout import (
@@ -328,7 +328,7 @@ def write_csv(path: Path | str, columns: Mapping[str, NDArray[Any]], units: Mapp
         message = f"no column of a `.csv` can be called `{odd}`"
         raise TraceError.of("E605", message, help=("write a `.npz`, which holds any name",))
     rows = zip(*(values.tolist() for values in columns.values()), strict=True)
-    write_atomic(path, _line(heads) + "".join(f"{','.join(map(repr, row))}\n" for row in rows))
+    File(path).write(_line(heads) + "".join(f"{','.join(map(repr, row))}\n" for row in rows))
 
 
 def _names_in(heads: Sequence[str]) -> list[str]:

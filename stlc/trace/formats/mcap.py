@@ -22,7 +22,7 @@ import numpy as np
 
 from stlc.escape import topic as topic_of
 from stlc.extras import needed
-from stlc.files import atomic_path
+from stlc.files import File
 from stlc.jsontext import loads
 from stlc.trace.formats.messages import LONGEST, Bytes, Channel, DamageError, Decode, Log, Room, mapped
 from stlc.trace.formats.paths import Selection
@@ -199,7 +199,7 @@ def write(path: Path | str, trace: Trace) -> None:
         for each in trace.signature.columns
     }
     stamps = [origin + round(float(t) * 1e9) for t in trace.times]
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
+    with File(path).replaced() as temporary, temporary.open("wb") as file:
         writer = writers.Writer(file)
         writer.start(profile="", library="stlc")
         described = {"$schema": _DIALECT, "type": "object", "properties": properties}

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.lib.format as npy
 
 from stlc.diagnostics import TraceError
-from stlc.files import atomic_path, opened_regular
+from stlc.files import File
 from stlc.signature import Column
 from stlc.trace.formats.arrays import Array, Arrays, no_letters
 from stlc.trace.formats.registry import damage, opened, require_room, unreadable
@@ -41,7 +41,7 @@ _ZIP_MAGIC = (b"PK\x03\x04", b"PK\x05\x06")
 def read(path: Path, wanted: Wanted = ALL) -> Recording:
     """Read the arrays that are kept; no other is unpacked. Raises UsageError (U102) or TraceError (E603)."""
     with opened(path):
-        file = opened_regular(path)
+        file = File(path).opened()
     found, extras = Arrays(wanted), dict[str, Array]()
     total = 0
     with file, damage(path):
@@ -66,7 +66,7 @@ def read(path: Path, wanted: Wanted = ALL) -> Recording:
 def read_arrays(path: Path) -> dict[str, Array]:
     """Read all arrays of an archive, by name. Raises UsageError (U102) or TraceError (E603), as `read`."""
     with opened(path):
-        file = opened_regular(path)
+        file = File(path).opened()
     found: dict[str, Array] = {}
     total = 0
     with file, damage(path):
@@ -236,7 +236,7 @@ def write_npz(path: Path | str, arrays: Mapping[str, Array]) -> None:
         TraceError: E603, a name is too long.
         MissingError: R201, no space left or no permission; an existing file is not changed.
     """
-    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
+    with File(path).replaced() as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
         for name, array in arrays.items():
             if len(name.encode()) > MAX_NAME:
                 raise unreadable(Path(path), f"a name of {len(name)} characters is too long for an archive")

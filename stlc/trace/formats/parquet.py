@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stlc.diagnostics import TraceError, UsageError
 from stlc.extras import needed
-from stlc.files import atomic_path
+from stlc.files import File
 from stlc.signature import MAX_COMPONENTS
 from stlc.trace.formats.arrays import Array, Arrays
 from stlc.trace.formats.csv import split_head
@@ -116,7 +116,7 @@ def write_columns(path: Path, columns: Mapping[str, tuple[str, Sequence[Any]]]) 
     """
     arrow = needed("pyarrow")
     arrays = {name: arrow.array(values, type=kind) for name, (kind, values) in columns.items()}
-    with atomic_path(path) as temporary:
+    with File(path).replaced() as temporary:
         needed("pyarrow.parquet").write_table(arrow.table(arrays), temporary)
 
 

@@ -22,7 +22,7 @@ from stlc.dynamics.scenario import under
 from stlc.dynamics.system import System
 from stlc.dynamics.uncertainty.disturbance import Disturbance, ErrorSizes
 from stlc.dynamics.uncertainty.perturbed import PerturbedSystem
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar.parser import parse
 from stlc.source import Source
 
@@ -74,7 +74,7 @@ def cart(scenario: str | None) -> Task:
 @cache
 def task_of(spec: str, system: str, scenario: str) -> Task:
     files = ROOT / "specs" / f"{spec}.stl", ROOT / "examples" / f"{system}.yaml"
-    return Task.of(parse(read_source(files[0])), System.load(files[1], scenario=scenario))
+    return Task.of(parse(File(files[0]).read()), System.load(files[1], scenario=scenario))
 
 
 class Sampled:
@@ -201,7 +201,7 @@ def test_after_the_steps_with_errors_the_model_is_followed(steps: int) -> None:
 def test_inner_feedback_is_part_of_the_tube() -> None:
     files = (ROOT / "examples" / "tasks" / f"cart_pole.{end}" for end in ("stl", "yaml"))
     spec, system = next(files), System.load(next(files), scenario="mismatch-5")
-    task = Task.of(parse(read_source(spec)), system)
+    task = Task.of(parse(File(spec).read()), system)
     assert task.plain.decl.feedback is not None
     check(task, 40, steps=3, plans=4)
 

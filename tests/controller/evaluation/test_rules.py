@@ -22,7 +22,7 @@ from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.diagnostics import RunError, SpecError, SystemFileError
 from stlc.dynamics.system import System
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar.parser import parse
 from stlc.jsontext import plain
 from stlc.rundir import RunDir
@@ -65,7 +65,7 @@ def home(tmp_path: Path) -> Path:
 
 
 def task_of(home: Path, overrides: Mapping[str, str] | None = None) -> Task:
-    spec = parse(read_source(home / "car/cart.stl"))
+    spec = parse(File(home / "car/cart.stl").read())
     return Task.of(spec, System.load(home / "car/cart.yaml", overrides or {}))
 
 
@@ -283,7 +283,7 @@ def test_a_drive_that_ends_too_early_is_neither(home: Path) -> None:
 
 def text_of(home: Path, text: str):  # type: ignore[no-untyped-def]
     (home / "other.stl").write_text(text)
-    return read_source(home / "other.stl")
+    return File(home / "other.stl").read()
 
 
 def test_without_rules_every_start_counts() -> None:

@@ -10,7 +10,7 @@ from stlc.controller.problem.native import NativeStep
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import UsageError
 from stlc.dynamics.system import System
-from stlc.files import find_system, read_source
+from stlc.files import File
 from stlc.grammar.parser import parse
 from stlc.source import Source
 
@@ -123,9 +123,9 @@ def test_rewards_of_the_paper(name: str, state: dict[str, float], reward: float)
 
 def of_benchmark(name: str) -> Task:
     path = ROOT / "specs" / f"{name}.stl"
-    spec = parse(read_source(path))
+    spec = parse(File(path).read())
     assert spec.system is not None
-    return Task.of(spec, System.load(find_system(spec.system, path)))
+    return Task.of(spec, System.load(File(spec.system).system(path)))
 
 
 BENCHMARKS = ("traffic", "reach_n_avoid", "ship_safe", "ship_track", "navigation", "manipulation")

@@ -14,7 +14,7 @@ from stlc.controller.problem.task import Task
 from stlc.controller.search import ascent
 from stlc.controller.search.ascent import APART, KEPT, GradientAscent
 from stlc.dynamics.system import System
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar.parser import parse
 from tests.controller.guard.test_prefix_shooting import F64, failing
 
@@ -39,7 +39,7 @@ def worth(task: Task, x: Tensor, plans: Tensor) -> Tensor:
 @pytest.fixture(scope="module")
 def rover_task() -> Task:
     """One of the controls is a direction, which turns round."""
-    spec = parse(read_source(ROOT / "specs" / "navigation.stl"))
+    spec = parse(File(ROOT / "specs" / "navigation.stl").read())
     return Task.of(spec, System.load(ROOT / "examples" / "rover.yaml"))
 
 

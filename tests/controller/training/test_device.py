@@ -17,7 +17,7 @@ from stlc.controller.run.checkpoint import load_checkpoint, save_checkpoint
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import Trainer
 from stlc.dynamics.system import System
-from stlc.files import read_source
+from stlc.files import File
 from stlc.grammar.parser import parse
 from stlc.rundir import RunDir
 
@@ -63,7 +63,7 @@ def _trained(trainer: Trainer) -> list[float]:
     ],
 )
 def test_training_elsewhere_gives_the_same(spec: str, system: str, tmp_path: Path) -> None:
-    text = parse(read_source(ROOT / "specs" / f"{spec}.stl"))
+    text = parse(File(ROOT / "specs" / f"{spec}.stl").read())
     task = Task.of(text, System.load(ROOT / "examples" / f"{system}.yaml"))
     here = _trained(_trainer(task, CPU))
     folder = RunDir.create(tmp_path, "far")

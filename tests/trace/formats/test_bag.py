@@ -13,7 +13,7 @@ import pytest
 from helpers import robot_logs
 
 from stlc.diagnostics import StlcError
-from stlc.files import find_trace
+from stlc.files import File
 from stlc.trace import Reading, Trace, load_trace
 from stlc.trace.formats.messages import DamageError
 from stlc.trace.formats.paths import Selection
@@ -233,9 +233,9 @@ def test_a_bag_is_found_by_its_folder(tmp_path: Path) -> None:
     folder = tmp_path / "drive"
     folder.mkdir()
     with pytest.raises(StlcError, match="is a folder, not a trace"):
-        find_trace(str(folder))
+        File(str(folder)).trace()
     (folder / "drive_0.db3").write_bytes(robot_logs.bag2(X.tolist()))
-    assert find_trace(str(folder)) == folder
+    assert File(str(folder)).trace() == folder
 
 
 @pytest.mark.parametrize("fields", ["int32 sec\nuint32 nanosec", "uint32 nanosec\nint32 sec"])

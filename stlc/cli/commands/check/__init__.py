@@ -19,7 +19,7 @@ from stlc.cli.framework.output import QUIET, Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.diagnostics import UsageError, usage
 from stlc.escape import visible
-from stlc.files import SPEC_SUFFIXES, STDIN, has_wildcard, matching_traces, real, write_atomic
+from stlc.files import File
 from stlc.jsontext import plain
 from stlc.options import Options, require_no_jobs
 
@@ -132,9 +132,9 @@ def check(
 
         require_claim(certify, fail_under)
         _require_distinct(traces)
-    if STDIN in traces:
+    if File.STDIN in traces:
         _require_alone(traces, certify, out, cluster)
-    if question.uncertain and (STDIN in traces or chunk):
+    if question.uncertain and (File.STDIN in traces or chunk):
         raise usage("`--uncertain` needs the whole trace, and this one is judged in pieces")
     if question.uncertain and out is not None:
         raise usage("`--out` writes the robustness of the samples as they are: leave `--uncertain` out")
@@ -142,7 +142,7 @@ def check(
     written = [("--table", table), ("--junit", junit), *(("--out", path) for path in paths)]
     require_separate(written, (spec, judging.system, *traces))
     talk = not (QUIET.get() or json)
-    if STDIN in traces:
+    if File.STDIN in traces:
         with PULSE.doing(""):  # waits for samples
             outcomes = [_of_stream(question, talk=talk)]
     else:
@@ -157,7 +157,7 @@ def check(
     if junit is not None:
         from stlc.cli.commands.check.junit import junit as junit_xml
 
-        write_atomic(junit, junit_xml(outcomes, strict=question.strict))
+        File(junit).write(junit_xml(outcomes, strict=question.strict))
     verdicts = [outcome.verdict for outcome in outcomes if outcome.verdict is not None]
     findings = [finding for outcome in outcomes for finding in outcome.errors]
     findings += [finding for verdict in verdicts for finding in verdict.warnings]
@@ -324,16 +324,16 @@ def _expanded(names: Sequence[str], written: Sequence[Path]) -> list[str]:
         UsageError: U102, no file matches.
     """
     found: list[str] = []
-    own = set(map(real, written))
+    own = {File(path).real for path in written}
     for name in names:
-        if not has_wildcard(name):
+        if not File(name).is_pattern:
             found.append(name)
             continue
         known = set(found)
-        for match in matching_traces(name):
-            place = real(Path(match))
+        for match in File(name).matches():
+            place = File(match).real
             places = {place, *place.parents}
-            if match not in known and Path(match).suffix not in SPEC_SUFFIXES and own.isdisjoint(places):
+            if match not in known and not File(match).is_spec and own.isdisjoint(places):
                 found.append(match)
     if not found:
         raise UsageError.of("U102", f"no trace matches `{names[0]}`")
@@ -348,7 +348,7 @@ def _require_distinct(traces: Sequence[str]) -> None:
     """
     known: dict[Path, str] = {}
     for name in traces:
-        place = real(Path(name))
+        place = File(name).real
         other = known.get(place)
         if other is not None:
             same = f"`{other}` and `{name}` are the same file"
@@ -366,7 +366,7 @@ def _split_files(files: Sequence[str], spec: Path | None) -> tuple[Path | None, 
     Raises:
         UsageError: U101, there are several specifications, or no trace.
     """
-    specs = [name for name in files if Path(name).suffix in SPEC_SUFFIXES]
+    specs = [name for name in files if File(name).is_spec]
     traces = [name for name in files if name not in specs]
     if len(specs) > 1 or (specs and spec is not None):
         raise usage(f"more than one specification: {', '.join([*specs, *([str(spec)] if spec else [])])}")

@@ -11,7 +11,7 @@ from typing import Any
 
 from stlc.cli.commands.check.options import Judging
 from stlc.diagnostics import StlcError, UsageError, usage
-from stlc.files import find_spec, find_system, read_source
+from stlc.files import File
 from stlc.jsontext import dumps
 from stlc.monitor.check import Question, monitor_of
 from stlc.monitor.judgement import Evidence, InputFile
@@ -37,11 +37,11 @@ def _inputs(question: Question) -> list[Path]:
     if question.spec is None:  # the trace holds it, with its imports
         named, files, near = question.system, [], None
     else:
-        near = find_spec(question.spec)
-        spec = monitor_of(read_source(near), question).spec
+        near = File(question.spec).spec()
+        spec = monitor_of(File(near).read(), question).spec
         named, files = question.system or spec.system, [near, *imported_files(spec)]
     with suppress(StlcError):
-        files += [] if named is None else [find_system(named, near)]
+        files += [] if named is None else [File(named).system(near)]
     return [each for each in dict.fromkeys(files) if each.is_file()]
 
 

@@ -16,7 +16,7 @@ from stlc.cli.framework.output import table
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import CODES, Diagnostic, MissingError, StlcError, usage
 from stlc.escape import operand, visible
-from stlc.files import require_folder, seen_at
+from stlc.files import File
 
 if TYPE_CHECKING:
     from stlc.compile.semantics.tolerance import Status
@@ -222,7 +222,7 @@ def _lost(work: Work, lost: LostCall) -> Outcome:
 def _seen(work: Work) -> str:
     """Path of a file, which may lie in the newest run; the name as given if there is no such file."""
     with suppress(StlcError):
-        return str(seen_at(work.name, work.runs))
+        return str(File(work.name).seen(work.runs))
     return work.name
 
 
@@ -239,7 +239,7 @@ def outcomes_of(work: Work) -> list[Outcome]:
     from stlc.monitor.check import judge, too_large, write_robustness
 
     begun = time.perf_counter()
-    path = seen_at(work.name, work.runs)
+    path = File(work.name).seen(work.runs)
     notes = () if path == Path(work.name) else (f"taking {path}, of the newest run",)
     if work.out is not None and (work.chunk or too_large(path)):
         advice = "leave out --chunk" if work.chunk else "cut out what is of interest"
@@ -362,7 +362,7 @@ def out_paths(out: Path | None, names: Sequence[str]) -> list[Path | None]:
     if out.suffix:
         message = f"`--out {out}` is one file, and {len(names)} traces are judged"
         raise usage(message, "name a folder: --out robustness/")
-    require_folder(out)
+    File(out).require_folder()
     stems = [Path(name).stem for name in names]
     if len(set(stems)) < len(stems):
         stems = [f"{i:04d}-{stem}" for i, stem in enumerate(stems)]

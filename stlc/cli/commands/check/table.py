@@ -11,7 +11,7 @@ from typing import Any
 from stlc.cli.commands.check.many import Outcome
 from stlc.diagnostics import usage
 from stlc.escape import encodable, spreadsheet
-from stlc.files import write_atomic
+from stlc.files import File
 
 COLUMNS = {
     "file": "string",
@@ -67,7 +67,7 @@ def write_table(path: Path, outcomes: Sequence[Outcome]) -> None:
     writer.writerow(COLUMNS)
     for row in rows:  # no spreadsheet program runs their texts
         writer.writerow([spreadsheet(each) if isinstance(each, str) else each for each in row])
-    write_atomic(path, text.getvalue())
+    File(path).write(text.getvalue())
 
 
 def _rows(outcome: Outcome) -> Iterator[tuple[Any, ...]]:

@@ -63,9 +63,9 @@ def compile_(
     from stlc.diagnostics import usage
 
     if show == "ast" or show == "dot":
-        from stlc.files import spec_files
+        from stlc.files import File
 
-        return _trees(spec_files(files), show)
+        return _trees(File.specs(files), show)
     if len(files) > 1:
         advice = ("stlc compile SPEC", "stlc compile SPEC SPEC --show ast")
         raise usage("one specification is compiled at a time", *advice)
@@ -89,13 +89,13 @@ def _trees(names: Sequence[str], show: Literal["ast", "dot"]) -> Answer[ParsedFi
     """
     from stlc.cli.commands.compile.tree_text import as_dot, as_tree, as_values
     from stlc.diagnostics import Diagnostic, SpecError
-    from stlc.files import read_source
+    from stlc.files import File
     from stlc.grammar.parser import parse
 
     specs, findings = [], list[Diagnostic]()
     for name in names:
         try:
-            specs.append(parse(read_source(name)))
+            specs.append(parse(File(name).read()))
         except SpecError as error:
             findings += error.diagnostics
     if findings:
@@ -110,13 +110,13 @@ def _trees(names: Sequence[str], show: Literal["ast", "dot"]) -> Answer[ParsedFi
 def _files(spec: Path, system: str | None) -> list[str]:
     """Files to watch: the specification, and the system file if there is one."""
     from stlc.diagnostics import StlcError
-    from stlc.files import find_spec, find_system, read_source
+    from stlc.files import File
     from stlc.grammar.parser import parse
 
-    spec = find_spec(spec)
+    spec = File(spec).spec()
     try:
-        wanted = system or parse(read_source(spec)).system
-        return [str(spec), *([str(find_system(wanted, spec))] if wanted else [])]
+        wanted = system or parse(File(spec).read()).system
+        return [str(spec), *([str(File(wanted).system(spec))] if wanted else [])]
     except StlcError:
         return [str(spec)]
 
@@ -138,16 +138,16 @@ def _compiled(
     from stlc.compile.pipeline import Purpose, compile_spec
     from stlc.diagnostics import usage
     from stlc.dynamics.load import load_system_decl
-    from stlc.files import find_spec, find_system, read_source
+    from stlc.files import File
     from stlc.grammar.parser import parse
 
-    path = find_spec(path)
-    spec = parse(read_source(path))
+    path = File(path).spec()
+    spec = parse(File(path).read())
     wanted = system or spec.system
     if wanted is None:
         help_ = (f"stlc compile {path} --system FILE", 'or a line `system "FILE"` in the specification')
         raise usage(f"`{path}` names no system", *help_)
-    decl = load_system_decl(find_system(wanted, path), overrides)
+    decl = load_system_decl(File(wanted).system(path), overrides)
     purpose: Purpose = "check" if decl.judges_by(path) else "train"
     grid = Grid(decl.dt, decl.horizon)
     compiled = compile_spec(spec, grid=grid, interface=decl.interface(), overrides=overrides, purpose=purpose)

@@ -177,7 +177,7 @@ def closing(trace: str, drawn: Mapping[str, str], record: Path | None, system: s
         record: file of `--record`, if given.
         system: system file that the next command names; None if it is not needed.
     """
-    from stlc.files import find_trace
+    from stlc.files import File
 
     yield ""
     yield f"  trace      {visible(trace)}"
@@ -186,7 +186,7 @@ def closing(trace: str, drawn: Mapping[str, str], record: Path | None, system: s
     if not drawn:
         yield f"  pictures   {shell(('stlc', 'report', operand(str(Path(trace).parent))))}"
     found = (
-        find_trace("trace.npz")
+        File("trace.npz").trace()
         if Path("trace.npz").exists() or Path("runs/latest/trace.npz").exists()
         else None
     )
