@@ -24,7 +24,7 @@ from stlc.controller.problem.inputs import input_files
 from stlc.controller.problem.task import Task
 from stlc.controller.run.checkpoint import load_checkpoint
 from stlc.controller.run.config import HELD_OUT, HELD_OUT_SEED
-from stlc.controller.run.run import Run, spec_hash, system_hash
+from stlc.controller.run.run import Run
 from stlc.controller.training.config import ENGINE_VERSION, TrainConfig
 from stlc.diagnostics import StlcError
 from stlc.options import Clock
@@ -441,7 +441,7 @@ def training_accuracy(folder: RunDir) -> float | None:
 
     The result is None if training drew new states in every step.
     """
-    saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
+    saved = load_checkpoint(folder, **folder.hashes)
     states = saved.tensors.get("training.states")
     if states is None:
         return None

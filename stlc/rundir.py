@@ -11,6 +11,7 @@ Python that a run names is run only by commands that drive (`stlc.foreign`).
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -36,6 +37,7 @@ from stlc.files import (
     within,
 )
 from stlc.jsontext import data_of, dumps
+from stlc.provenance import sha256
 from stlc.records import read
 from stlc.registry import did_you_mean
 from stlc.source import Source
@@ -144,6 +146,9 @@ class RunDir:
     """Trace and scene of the first seed without guard, stored beside the guarded ones."""
     SIMULATION: ClassVar = "eval/simulate.json"
     HELD_OUT: ClassVar = "eval/held_out.npz"
+    LIB: ClassVar = "lib"
+    INDEX: ClassVar = "index.json"
+    """Folder of the imports of the specification, and the file there that has their names."""
     MOST_JSON: ClassVar = 50_000_000
     MOST_ARRAYS: ClassVar = 2_000_000_000
     """Largest sizes in bytes of a file of JSON, and of a file of arrays or tensors."""
@@ -325,6 +330,32 @@ class RunDir:
     def claimed(self) -> AbstractContextManager[bool]:
         """Context in which this process alone trains the run; its value is False if another process does."""
         return alone_in(self.path)
+
+    # ------------------------------------------------------------------ specification and system
+
+    def library(self, below: str = LIB) -> dict[str, str]:
+        """Texts that the specification imports, by name of the import, from the subfolder `below`.
+
+        Raises:
+            RunError: R101, a text is damaged; R110, a name leads out of the run.
+        """
+        if not self.has(f"{below}/{RunDir.INDEX}"):
+            return {}
+        index: dict[str, str] = self.read_json(f"{below}/{RunDir.INDEX}", dict[str, str])
+        return {key: self.source(f"{below}/{name}").text for key, name in index.items()}
+
+    @property
+    def hashes(self) -> dict[str, str]:
+        """SHA-256 of the specification with its imports, and of the system, each with the `--set` changes."""
+        changes = json.dumps(self.record().get("overrides") or {}, sort_keys=True)
+        library = self.library()
+        imports = json.dumps(dict(sorted(library.items()))) if library else ""
+        return {
+            "spec_hash": sha256(self.source(RunDir.SPEC).text + changes + imports),
+            "system_hash": sha256(self.source(RunDir.SYSTEM).text + changes),
+        }
+
+    # ------------------------------------------------------------------ rows
 
     def damaged(self, name: str, error: Exception) -> Diagnostic:
         """Return the diagnostic R101 for a file of the run that cannot be read, or has wrong content."""

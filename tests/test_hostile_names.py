@@ -29,7 +29,7 @@ from stlc.grammar.parser import parse
 from stlc.grammar.printer import show
 from stlc.signature import Column, Signature
 from stlc.source import Source
-from stlc.trace import Trace, TraceMeta, read_recording, save_trace
+from stlc.trace import Trace, TraceMeta, read_recording
 
 RECORDED = [name for name in OF_FILES if name not in ("x[0]", "meta", "t")]
 """Names of signals of a recorded trace: no component, no array that a file has anyway."""
@@ -65,7 +65,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 @pytest.fixture
 def judged(folder: Path) -> list[str]:
     (folder / "h.stl").write_text(text_of(REQUIRED), encoding="utf-8", newline="")
-    save_trace("h.npz", zeros(REQUIRED))
+    zeros(REQUIRED).save("h.npz")
     return REQUIRED
 
 
@@ -228,7 +228,7 @@ def test_a_csv_gives_names_back_or_refuses_them() -> None:
     for name in RECORDED:
         trace = zeros([name], traces=1)
         try:
-            save_trace("one.csv", trace)
+            trace.save("one.csv")
         except TraceError as error:
             codes.add(error.diagnostics[0].code)
             continue
@@ -243,7 +243,7 @@ def test_a_csv_gives_names_back_or_refuses_them() -> None:
 def test_formulas_of_a_spreadsheet_do_not_run_and_come_back() -> None:
     names = ["=1+1", "+a", "-a", "@SUM", "'=1", "=cmd|' /C calc'!A0", "a,b", 'say "x"']
     data = {name: np.zeros((1, 3)) for name in names}
-    save_trace("f.csv", Trace(Signature(tuple(map(Column, data))), 0.1, data))
+    Trace(Signature(tuple(map(Column, data))), 0.1, data).save("f.csv")
     first = next(csv.reader(Path("f.csv").read_text(encoding="utf-8").split("\n")[:1]))
     assert not [cell for cell in first if cell[0] in "=+-@"]
     assert list(read_recording(Path("f.csv")).groups[0].arrays) == ["t", *names]
@@ -257,7 +257,7 @@ def test_a_stream_has_the_names_of_a_file(folder: Path, said: Said, monkeypatch:
     row = dict.fromkeys(names, 0.0)
     lines = "".join(json.dumps({"t": 0.1 * k, **row}) + "\n" for k in range(5))
     data = {name: np.zeros((1, 5)) for name in names[:3]}
-    save_trace("s.csv", Trace(Signature(tuple(map(Column, data))), 0.1, data))
+    Trace(Signature(tuple(map(Column, data))), 0.1, data).save("s.csv")
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(lines.encode())))
     assert said("check", "s.stl", "-")[0] == 1
     (folder / "c.stl").write_text(text_of_signals(names[:3]), encoding="utf-8")
@@ -272,7 +272,7 @@ def text_of_signals(names: list[str]) -> str:
 
 def test_a_trace_that_carries_half_a_character_is_judged(said: Said) -> None:
     trace = zeros(["<b>"], text=text_of(["<b>"]).replace("spec `plain`", "spec `a\ud800`"))
-    save_trace("half.npz", trace)
+    trace.save("half.npz")
     assert said("check", "half.npz")[0] == 1
     assert document(said, "check", "half.npz", "--json")[0] == 1
 
@@ -286,7 +286,7 @@ def test_a_trace_that_carries_half_a_character_is_judged(said: Said) -> None:
 def test_files_of_any_name_are_named_in_one_line(name: str, folder: Path, said: Said) -> None:
     spec, trace = f"{name}.stl", f"{name}.npz"
     (folder / spec).write_text(text_of(["a"]), encoding="utf-8")
-    save_trace(folder / trace, zeros(["a"]))
+    zeros(["a"]).save(folder / trace)
     code, text = said("check", "--", spec, trace)
     assert code == 1
     assert text.split("\n")[0].startswith(f"{seen(spec)} on {seen(trace)}    2 traces")
@@ -404,6 +404,6 @@ def test_an_installation_is_looked_at_whatever_its_folders_are_called(
 @pytest.mark.apart
 def test_margins_for_a_viewer_give_every_name_back(judged: list[str], said: Said) -> None:
     pytest.importorskip("mcap")
-    save_trace("one.npz", zeros(REQUIRED, traces=1))
+    zeros(REQUIRED, traces=1).save("one.npz")
     assert said("check", "h.stl", "one.npz", "--out", "o.mcap")[0] == 1
     assert sorted(read_recording(Path("o.mcap")).columns) == sorted(judged)

@@ -27,7 +27,7 @@ from stlc.plugins import plugins, variable
 from stlc.registry import GUARDS, METHODS, PLANNERS, PackageRegistry
 from stlc.rundir import RunDir
 from stlc.trace.formats.registry import ELSEWHERE, suffixes
-from stlc.trace.trace import load_trace
+from stlc.trace.trace import Trace
 
 ROOT = Path(__file__).resolve().parents[1]
 TOY = ROOT / "tests/data/toy"
@@ -142,7 +142,7 @@ def test_a_planner_and_a_format_of_a_package(
     document = json.loads(capsys.readouterr().out)["result"]
     assert (document["method"], document["evaluations"]) == ("levels", 5)
     assert Path("plan.ltsv").read_text().startswith("t:0\tx:")
-    trace = load_trace("plan.ltsv")
+    trace = Trace.load("plan.ltsv")
     assert trace.dt == 0.1
     code = main(["check", "plan.ltsv", SPEC, "--json"])
     document = json.loads(capsys.readouterr().out)

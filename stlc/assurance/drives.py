@@ -27,7 +27,7 @@ from stlc.controller.evaluation.executed import executed_robustness
 from stlc.controller.evaluation.rules import Rules, rules_for, verdict_on_runs
 from stlc.controller.guard.guard import Guard
 from stlc.controller.run.checkpoint import FOLDER, POINTER, CheckpointHead
-from stlc.controller.run.run import CONFIG, declaration_of_run, spec_hash, system_hash
+from stlc.controller.run.run import CONFIG, Run
 from stlc.controller.world import independent_agents, world_type
 from stlc.dynamics.functions import function_files
 from stlc.jsontext import plain
@@ -181,8 +181,8 @@ def inputs_of(folder: RunDir, decl: SystemDecl, rules: Rules | None, guard: str)
     judge = "" if rules is None else spec_sha256(rules.spec.source.text, rules.spec.library or {})
     changes = [] if rules is None else sorted(rules.overrides.items())
     return CertifiedInputs(
-        spec_hash(folder),
-        system_hash(folder),
+        folder.hashes["spec_hash"],
+        folder.hashes["system_hash"],
         functions=sha256("\0".join(f"{name} {sha256(path.read_bytes())}" for name, path in files)),
         rules=None if rules is None else sha256(f"{judge} {changes}"),
         world=None if decl.test.world is None else sha256(decl.test.world.path.read_bytes()),
@@ -202,7 +202,7 @@ def verify(stored: StoredCertificate, folder: RunDir) -> CertificateVerification
         SpecError, SystemFileError, RunError: the folder is damaged.
     """
     conditions = stored.conditions
-    decl = declaration_of_run(folder, conditions.overrides, conditions.scenario)
+    decl = Run.declaration_in(folder, conditions.overrides, conditions.scenario)
     present: Any = plain(inputs_of(folder, decl, rules_for(folder, decl), conditions.guard))
     return compared(stored, present)
 

@@ -35,7 +35,7 @@ from stlc.plants.plant import PlantFinding
 from stlc.records import read
 from stlc.registry import GUARDS
 from stlc.rundir import RunDir
-from stlc.trace import Trace, load_trace, save_trace
+from stlc.trace import Trace
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -210,10 +210,10 @@ def _written(source: _Source, simulator: _Simulator, result: Falsification) -> F
     margin, trace = best.margin, path.with_suffix(".npz")
     folder.mkdir(parents=True, exist_ok=True)
     if source.options.plant is None:
-        save_trace(trace, simulator.trace(best.point[None]))
+        simulator.trace(best.point[None]).save(trace)
     else:
         repeated = _plant_of(simulator, path).repeated(best.point, simulator.requirements.index(name))
-        save_trace(trace, repeated.trace)
+        repeated.trace.save(trace)
         margin = repeated.margin
     stored = StoredCounterexample(name, margin, trace.name, source.settings(), best.point.tolist())
     File(path).write(dumps(stored) + "\n")
@@ -274,7 +274,7 @@ def _replayed(source: _Source, path: Path) -> ReplayedCounterexample | ReplayedF
     if getattr(simulator, "findings", ()):
         before = StoredFinding(f"a violation of {stored.requirement}", "", kept, stored.point)
         return _failed_again(_plant_of(simulator, path), point, before)
-    different = _different(load_trace(path.parent / Path(stored.trace).name), simulator.trace(point[None]))
+    different = _different(Trace.load(path.parent / Path(stored.trace).name), simulator.trace(point[None]))
     return ReplayedCounterexample(
         stored.requirement, verdict, margin, stored.margin, not different, different
     )

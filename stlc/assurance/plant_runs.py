@@ -13,7 +13,7 @@ from stlc.assurance.plant_judge import JudgedRun, PlantJudge, PlantSimulation
 from stlc.diagnostics import notice, usage
 from stlc.escape import visible
 from stlc.registry import did_you_mean
-from stlc.trace import Trace, check_writable, save_trace
+from stlc.trace import Trace
 
 if TYPE_CHECKING:
     from stlc.assurance.options import SimulateOptions
@@ -36,7 +36,7 @@ def plant_simulation(spec: str, options: SimulateOptions) -> PlantSimulation:
             raise usage(f"`{name}` is for trained policies and planners, and `--plant` has neither")
     assert options.plant is not None
     if options.record is not None:
-        check_writable(options.record)
+        Trace.check_writable(options.record)
     judge = PlantJudge.load(spec, options.plant, options.overrides)
     plant, monitor = judge.plant, judge.monitor
     for warning in monitor.compiled.warnings:
@@ -55,7 +55,7 @@ def plant_simulation(spec: str, options: SimulateOptions) -> PlantSimulation:
                 runs.append(replace(run, trace=None))
                 PULSE.now(f"simulating {plant.decl.name}, {len(runs)} of {len(points)}")
     if options.record is not None and traces:
-        save_trace(options.record, judge.stored(traces))
+        judge.stored(traces).save(options.record)
     decl, written = plant.decl, None if options.record is None else str(options.record)
     about = (monitor.compiled.name, decl.name, decl.kind, float(decl.dt), decl.steps)
     return PlantSimulation(*about, stream, written, tuple(runs), plant.variables)

@@ -36,7 +36,7 @@ from stlc.jsontext import Count
 from stlc.options import checked_share
 from stlc.registry import GUARDS, PLANNERS
 from stlc.rundir import RunDir
-from stlc.trace import check_writable
+from stlc.trace import Trace
 from stlc.units import time_text
 
 if TYPE_CHECKING:
@@ -172,7 +172,7 @@ def simulation(
             raise usage(f"`{name}` is for plants", "stlc simulate SPEC --plant FILE")
     guard = options.guarded
     if options.record is not None:
-        check_writable(options.record)
+        Trace.check_writable(options.record)
     if options.certify is not None:
         checked_share("--certify", options.certify)
     planner = _planner(options)

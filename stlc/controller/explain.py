@@ -50,11 +50,11 @@ def explain(
     """
     if guarantee:
         from stlc.controller.guard.coverage import guarantee as bounds
-        from stlc.controller.run.run import folder_of, task_of_run
+        from stlc.controller.run.run import Run
 
         run: Any = what or "latest"
-        folder = folder_of(run, runs)
-        return bounds(folder.name, task_of_run(folder, options.get("overrides")))
+        folder = Run.folder(run, runs)
+        return bounds(folder.name, Run.task_in(folder, options.get("overrides")))
     if what is None:
         return CodeList(dict(CODES))
     if isinstance(what, ast.Spec):

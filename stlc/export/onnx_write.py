@@ -14,7 +14,7 @@ import torch
 from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.backends.onnx.graph import BATCH, KINDS, GraphBody, GraphNode, OnnxGraph, Value
 from stlc.controller.guard.candidates import grid_of
-from stlc.controller.run.run import Run, spec_hash, system_hash
+from stlc.controller.run.run import Run
 from stlc.diagnostics import usage
 from stlc.export.onnx_graphs import deciding, falling, following, judging
 from stlc.extras import needed
@@ -185,8 +185,8 @@ def _facts(run: Run) -> dict[str, object]:
         "format": FORMAT,
         "stlc": __version__,
         "run": run.dir.name,
-        "spec": {"name": task.compiled.name, "sha256": spec_hash(run.dir)},
-        "system": {"name": task.system.decl.name, "sha256": system_hash(run.dir)},
+        "spec": {"name": task.compiled.name, "sha256": run.dir.hashes["spec_hash"]},
+        "system": {"name": task.system.decl.name, "sha256": run.dir.hashes["system_hash"]},
         "states": [asdict(each) for each in _states(task)],
         "controls": [
             asdict(ControllerQuantity(each.name, str(each.unit), each.low, each.high))

@@ -278,7 +278,7 @@ def write_robustness(path: Path, verdict: Verdict, question: Question) -> None:
     import numpy as np
 
     from stlc.signature import Column, Signature
-    from stlc.trace import Trace, save_trace
+    from stlc.trace import Trace
     from stlc.units import Unit
 
     trace = verdict.subject.signals.trace
@@ -294,7 +294,7 @@ def write_robustness(path: Path, verdict: Verdict, question: Question) -> None:
     signature = Signature(tuple(Column(name, units[name]) for name in data))
     path.parent.mkdir(parents=True, exist_ok=True)
     meta = replace(trace.meta, spec_text="", spec_path="", judge_text="", judge_path="")
-    save_trace(path, Trace(signature, trace.dt, data, trace.t0, meta=meta, name=str(path)))
+    Trace(signature, trace.dt, data, trace.t0, meta=meta, name=str(path)).save(path)
 
 
 def judge_lines(

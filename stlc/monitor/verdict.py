@@ -51,7 +51,7 @@ from stlc.monitor.signals import WHOLE, Excerpt, Need, arrange, needs_of, plain_
 from stlc.monitor.uncertain import Uncertainties, outer, outer_of, uncertain_record
 from stlc.monitor.values import Ends, Record, decisive
 from stlc.source import Source
-from stlc.trace import Reading, Trace, load_trace
+from stlc.trace import Reading, Trace
 
 if TYPE_CHECKING:
     from stlc.monitor.online.online import How, Online
@@ -293,7 +293,7 @@ class Monitor:
                 self._readings[key] = reading_of(self.spec, read=self.reads(names))
             reading = self._readings[key]
             if isinstance(given, (str, Path)):
-                given = load_trace(given, reading)
+                given = Trace.load(given, reading)
             elif is_frame(given):
                 step = None if self._given.dt is None else float(self._given.dt)
                 given = trace_of_table(given, replace(reading, dt=step))

@@ -6,10 +6,7 @@ from stlc.trace.trace import (
     Trace,
     TraceMeta,
     as_fraction,
-    check_writable,
-    load_trace,
     read_recording,
-    save_trace,
     trace_of,
     traces_of,
 )
@@ -20,10 +17,7 @@ __all__ = [
     "Trace",
     "TraceMeta",
     "as_fraction",
-    "check_writable",
-    "load_trace",
     "read_recording",
-    "save_trace",
     "trace_of",
     "traces_of",
 ]

@@ -39,7 +39,7 @@ def pieces(path: Path, samples: int, reading: Reading) -> Iterator[Trace]:
     """Yield the trace of a file in chunks of `samples` samples, whose times continue from chunk to chunk.
 
     Raises:
-        TraceError: the errors of `stlc.trace.trace.load_trace`; E605, the file holds several traces, or its
+        TraceError: the errors of `Trace.load`; E605, the file holds several traces, or its
             format cannot be read in chunks.
     """
     found = format_of(path)

@@ -44,9 +44,7 @@ __all__ = [
     "Trace",
     "TraceMeta",
     "as_fraction",
-    "load_trace",
     "read_recording",
-    "save_trace",
     "trace_of",
     "traces_of",
 ]
@@ -106,6 +104,54 @@ class Trace:
         several = {"trace": np.repeat(np.arange(self.traces), self.samples)} if self.traces > 1 else {}
         signals = {name: values.ravel() for name, values in self.data.items()}
         return frame({**several, "t": np.tile(self.times, self.traces), **signals})
+
+    @staticmethod
+    def load(path: Path | str, reading: Reading | None = None) -> Trace:
+        """Read a trace; the suffix of the file determines the format.
+
+        Suffixes are `.csv`, `.tsv`, `.jsonl`, `.parquet`, `.mat`, `.mcap`, `.bag`, `.db3`, `.ulg` and `.mf4`;
+        a folder is a ROS 2 bag, and any other file is read as `.npz`. Values may be NaN (unknown) or infinite.
+
+        Raises:
+            UsageError: U102, there is no such file.
+            MissingError: R301, the format needs a package that is not installed.
+            TraceError: E601, no times, or no such signal; E602, times are not uniform; E603, the file cannot
+                be read safely; E605, its arrays do not fit together, or it holds objects of different times.
+        """
+        reading = reading or AS_IT_IS
+        return trace_of(read_recording(Path(path), reading.wanted), reading)
+
+    def save(self, path: Path | str) -> None:
+        """Write the trace; the suffix of the path determines the format.
+
+        A `.csv` file contains the signals only. An `.mcap` file does not contain the arrays `extras`.
+
+        Raises:
+            UsageError: U101, the suffix is none of `.npz`, `.csv` and `.mcap`.
+            MissingError: R301, an `.mcap` file needs a package that is not installed.
+            TraceError: E605, a signal has a name that the format reserves.
+            MissingError: R201, no space left or no permission; an existing file is not changed.
+        """
+        self.check_writable(path)
+        taken = [name for name in self.data if name in RESERVED or name.startswith(EXTRA)]
+        if taken:
+            raise TraceError.of("E605", f"a recorded signal cannot be called `{taken[0]}`")
+        format_of(Path(path)).function("write")(path, self)
+
+    @staticmethod
+    def check_writable(path: Path | str) -> None:
+        """Check that the format of a path can be written.
+
+        Raises:
+            UsageError: U101, files with this suffix cannot be written.
+            MissingError: R301, an `.mcap` file needs a package that is not installed.
+        """
+        suffix, found = Path(path).suffix.lower(), format_of(Path(path))
+        if found.writes and suffix == found.suffixes[0]:
+            found.require()
+        elif not Path(path).is_char_device():
+            message = f"`{path}`: a trace is written as {', '.join(WRITTEN[:-1])} or {WRITTEN[-1]}"
+            raise usage(message, f"e.g. {Path(path).stem or 'trace'}{WRITTEN[0]}")
 
     @property
     def file(self) -> str:
@@ -251,26 +297,11 @@ def read_recording(path: Path, wanted: Wanted = ALL) -> Recording:
     return found
 
 
-def load_trace(path: Path | str, reading: Reading = AS_IT_IS) -> Trace:
-    """Read a trace; the suffix of the file determines the format.
-
-    Suffixes are `.csv`, `.tsv`, `.jsonl`, `.parquet`, `.mat`, `.mcap`, `.bag`, `.db3`, `.ulg` and `.mf4`; a
-    folder is a ROS 2 bag, and any other file is read as `.npz`. Values may be NaN (unknown) or infinite.
-
-    Raises:
-        UsageError: U102, there is no such file.
-        MissingError: R301, the format needs a package that is not installed.
-        TraceError: E601, no times, or no such signal; E602, times are not uniform; E603, the file cannot be
-            read safely; E605, its arrays do not fit together, or it holds objects of different times.
-    """
-    return trace_of(read_recording(Path(path), reading.wanted), reading)
-
-
 def trace_of(recording: Recording, reading: Reading = AS_IT_IS) -> Trace:
     """Convert the content of a trace file to one trace, with renamed signals, on one uniform grid.
 
     Raises:
-        TraceError: the errors of `load_trace`.
+        TraceError: the errors of `Trace.load`.
     """
     traces = traces_of(recording, reading)
     if len(traces) > 1:
@@ -284,7 +315,7 @@ def traces_of(recording: Recording, reading: Reading = AS_IT_IS) -> tuple[Trace,
     """Convert the content of a trace file to traces, one for each object with times of its own.
 
     Raises:
-        TraceError: the errors of `load_trace`.
+        TraceError: the errors of `Trace.load`.
     """
     read = reading.read_in_file
     _require_readable(recording, read)
@@ -384,42 +415,6 @@ def _trace(recording: Recording, t0: float, dt: float, data: dict[str, Floats]) 
         others=recording.others,
         labels=recording.labels,
     )
-
-
-# ----------------------------------------------------------------------- writing
-
-
-def save_trace(path: Path | str, trace: Trace) -> None:
-    """Write a trace; the suffix of the path determines the format.
-
-    A `.csv` file contains the signals only. An `.mcap` file does not contain the arrays `trace.extras`.
-
-    Raises:
-        UsageError: U101, the suffix is none of `.npz`, `.csv` and `.mcap`.
-        MissingError: R301, an `.mcap` file needs a package that is not installed.
-        TraceError: E605, a signal has a name that the format reserves.
-        MissingError: R201, no space left or no permission; an existing file is not changed.
-    """
-    check_writable(path)
-    taken = [name for name in trace.data if name in RESERVED or name.startswith(EXTRA)]
-    if taken:
-        raise TraceError.of("E605", f"a recorded signal cannot be called `{taken[0]}`")
-    format_of(Path(path)).function("write")(path, trace)
-
-
-def check_writable(path: Path | str) -> None:
-    """Check that the format of a path can be written.
-
-    Raises:
-        UsageError: U101, files with this suffix cannot be written.
-        MissingError: R301, an `.mcap` file needs a package that is not installed.
-    """
-    suffix, found = Path(path).suffix.lower(), format_of(Path(path))
-    if found.writes and suffix == found.suffixes[0]:
-        found.require()
-    elif not Path(path).is_char_device():
-        message = f"`{path}`: a trace is written as {', '.join(WRITTEN[:-1])} or {WRITTEN[-1]}"
-        raise usage(message, f"e.g. {Path(path).stem or 'trace'}{WRITTEN[0]}")
 
 
 def as_fraction(dt: float | Fraction) -> Fraction:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from stlc.compile.ir.traverse import margin_unit
-from stlc.controller.run.run import read_library
 from stlc.diagnostics import StlcError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.load import load_system_decl
@@ -19,7 +18,7 @@ from stlc.monitor.verdict import Monitor
 from stlc.rundir import RunDir
 from stlc.signature import Signature
 from stlc.source import Source, Span
-from stlc.trace import Trace, load_trace
+from stlc.trace import Trace
 from stlc.view.held_out import HeldOut, load_held_out
 
 T = TypeVar("T")
@@ -157,7 +156,7 @@ def read_contents(run: RunDir) -> RunContents:
     simulation = simulation_of(run)
     read = {name: run.read(name).decode("utf-8", "replace") for name in TEXTS if run.has(name)}
     spec = readable(
-        lambda: replace(parse(Source(RunDir.SPEC, read.get(RunDir.SPEC, ""))), library=read_library(run))
+        lambda: replace(parse(Source(RunDir.SPEC, read.get(RunDir.SPEC, ""))), library=run.library())
     )
     scenario = (simulation or {}).get("scenario")
     deployed = decl if decl is None or scenario is None else readable(lambda: under(decl, str(scenario)))
@@ -173,7 +172,7 @@ def read_contents(run: RunDir) -> RunContents:
         simulation=simulation,
         units={} if decl is None or spec is None else readable(lambda: _units(spec, decl)) or {},
         usual={} if deployed is None else {"agents": deployed.test.agents, "steps": deployed.test.steps},
-        trace=archived(run, RunDir.TRACE, load_trace),
+        trace=archived(run, RunDir.TRACE, Trace.load),
         system=system,
     )
 

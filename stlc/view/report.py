@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 from stlc.activity import PULSE
 from stlc.controller.guard.kind import named_guard
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
-from stlc.controller.run.run import Run, folder_of
+from stlc.controller.run.run import Run
 from stlc.escape import operand, shell
 from stlc.files import File
 from stlc.foreign import driving
@@ -101,7 +101,7 @@ def report(run: Run | Path | str = "latest", *, python: bool = False, runs: Path
         MissingError: R301, matplotlib or Pillow is missing; R201, the page cannot be written.
         RunError: R101, the folder is damaged.
     """
-    folder = folder_of(run, runs)
+    folder = Run.folder(run, runs)
     with PULSE.doing("drawing the report"), driving(python):
         write_report(folder)
     return Report(folder, learning_of_run(folder, Commands.of(folder.shown, folder.record())))

@@ -19,7 +19,7 @@ from stlc.diagnostics import StlcError
 from stlc.escape import file_part, picture
 from stlc.rundir import RunDir
 from stlc.source import Source
-from stlc.trace import Trace, load_trace
+from stlc.trace import Trace
 from stlc.trace.formats.npz import read_arrays
 from stlc.view import bullet
 from stlc.view.animation import (
@@ -185,7 +185,7 @@ def recorded_scene(run: RunDir, *, guarded: bool = True) -> RecordedScene | None
 
 def _judged(run: RunDir, trace_name: str, scene: Scene) -> SceneVerdicts | None:
     """Verdicts on the agents of a scene; None if the trace does not belong to this scene."""
-    decisions, trace = scene.get("decision"), archived(run, trace_name, load_trace)
+    decisions, trace = scene.get("decision"), archived(run, trace_name, Trace.load)
     if decisions is None or trace is None or trace.samples != frames_of(scene):
         return None
     if trace.traces < decisions.shape[1]:
@@ -293,7 +293,7 @@ def _trace_panels(run: RunDir) -> list[RunPanel]:
     animation = _signal_animation(run, "")
     if animation is None:
         return []
-    trace = load_trace(run.file(RunDir.TRACE, RunDir.MOST_ARRAYS))
+    trace = Trace.load(run.file(RunDir.TRACE, RunDir.MOST_ARRAYS))
 
     def record(shown: range) -> VectorAnimation:
         from stlc.view.vector import vector_animation
@@ -329,7 +329,7 @@ def _scenario(run: RunDir) -> str | None:
 
 
 def _signal_animation(run: RunDir, title: str) -> Animation | None:
-    trace = archived(run, RunDir.TRACE, load_trace)
+    trace = archived(run, RunDir.TRACE, Trace.load)
     if trace is None:
         return None
     region_map = readable(

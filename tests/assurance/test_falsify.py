@@ -20,7 +20,7 @@ from stlc.assurance.sharing import SharedSimulator, SimulatorWorkers
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
 from stlc.controller.parallel.workers import LocalProcesses
-from stlc.trace import load_trace
+from stlc.trace import Trace
 
 SYSTEM = """
 stlc: 1
@@ -186,7 +186,7 @@ def test_the_command_writes_what_it_can_replay(capsys):
     assert main(["falsify", "oscillator.stl", "--replay", "counterexamples/early.json"]) == 1
     assert "bit for bit" in capsys.readouterr().out
     stored = json.loads(Path("counterexamples/early.json").read_text())
-    trace = load_trace("counterexamples/early.npz")
+    trace = Trace.load("counterexamples/early.npz")
     assert float((0.9 - trace.data["x"][0, :41]).min()) == pytest.approx(stored["margin"], abs=1e-9)
     Path("oscillator.yaml").write_text(SYSTEM.replace("0.2 * v", "0.1 * v"))
     main(["falsify", "oscillator.stl", "--replay", "counterexamples/early.json"])
@@ -262,7 +262,7 @@ def test_a_failure_is_a_file_that_replays(capsys):
 def test_a_counterexample_whose_plant_fails_now(capsys):
     command = ["falsify", "fall.stl", "--plant", "fall.yaml", "--require", "up", "--simulations", "8"]
     assert main(command) == 1
-    trace = load_trace("counterexamples/up.npz")
+    trace = Trace.load("counterexamples/up.npz")
     assert (trace.meta.spec_name, trace.meta.dt) == ("fall", 0.05)
     assert main(["check", "counterexamples/up.npz"]) == 1
     Path("fall.py").write_text(FALL.replace("< -3", "< 99"))
@@ -313,7 +313,7 @@ def test_a_plant_that_does_not_repeat_itself_is_told(capsys):
     (found,) = json.loads(capsys.readouterr().out)["result"]["requirements"]
     assert found["trace_margin"] != (found["simpler"] or found["found"])["margin"]
     assert found["trace_margin"] == json.loads(Path(found["file"]).read_text())["margin"]
-    trace = load_trace("counterexamples/up.npz")
+    trace = Trace.load("counterexamples/up.npz")
     assert float(trace.data["h"][0, :13].min()) == pytest.approx(found["trace_margin"], abs=1e-9)
     assert main(command) == 1
     assert "the plant does not repeat itself" in capsys.readouterr().out

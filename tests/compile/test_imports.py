@@ -27,7 +27,7 @@ from stlc.grammar.parser import parse
 from stlc.monitor.explain.report import explain
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
-from stlc.trace import Trace, TraceMeta, load_trace, save_trace
+from stlc.trace import Trace, TraceMeta
 
 GEO = """
 const margin [m] = 50 cm
@@ -153,10 +153,10 @@ def test_a_trace_carries_what_its_specification_imports(files: Path, tmp_path: P
     compiled = compile_spec(spec, grid=Grid(Fraction(1, 10), 5))
     meta = TraceMeta(spec_name="main", spec_text=MAIN, spec_library=library_of(spec), horizon=5, dt=0.1)
     data = {"x": np.full((1, 6), 0.5), "y": np.full((1, 6), 9.0)}
-    save_trace(tmp_path / "t.npz", Trace(signature=compiled.signature, dt=0.1, data=data, meta=meta))
+    Trace(signature=compiled.signature, dt=0.1, data=data, meta=meta).save(tmp_path / "t.npz")
     files.unlink()
     (tmp_path / "shapes/geo.stl").unlink()
-    trace = load_trace(tmp_path / "t.npz")
+    trace = Trace.load(tmp_path / "t.npz")
     assert trace.meta.spec_library == meta.spec_library
     judge = Monitor(replace(parse(Source("t", trace.meta.spec_text)), library=trace.meta.spec_library))
     verdict = judge.check(trace)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from stlc.controller.problem.task import Task
-from stlc.controller.run.run import spec_hash, task_of_run
+from stlc.controller.run.run import Run
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.dynamics.system import System
@@ -44,12 +44,12 @@ def test_a_run_stands_on_its_own(home: Path, tmp_path_factory: pytest.TempPathFa
     x = torch.randn(200, 6, 2, generator=torch.Generator().manual_seed(0))
     wanted = task.robustness(x)
     shutil.rmtree(home)
-    again = task_of_run(folder)
+    again = Run.task_in(folder)
     torch.testing.assert_close(again.robustness(x), wanted)
     assert (folder.path / "lib/common/places.stl").is_file()
-    before = spec_hash(folder)
+    before = folder.hashes["spec_hash"]
     (folder.path / "lib/common/places.stl").write_text(
         "region post = circle([1, 1], 0.6)\n", encoding="utf-8"
     )
-    assert spec_hash(folder) != before
-    assert not torch.equal(task_of_run(folder).robustness(x), wanted)
+    assert folder.hashes["spec_hash"] != before
+    assert not torch.equal(Run.task_in(folder).robustness(x), wanted)

@@ -15,7 +15,7 @@ from stlc.diagnostics import TraceError
 from stlc.monitor.online.online import How
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
-from stlc.trace import Trace, load_trace, save_trace
+from stlc.trace import Trace
 from stlc.units import Unit
 
 DEGREES = np.array([20.0, 30.5, 45.0, 59.0, 58.0, 61.0])
@@ -79,8 +79,8 @@ def test_a_file_in_celsius_is_told_how_they_are_written(
 def test_units_of_files(suffix: str) -> None:
     for unit in ("degC", "K"):
         name = f"{unit}{suffix}"
-        save_trace(name, recorded(unit))
-        assert load_trace(name).signature["temp"].unit == Unit.parse(unit)
+        recorded(unit).save(name)
+        assert Trace.load(name).signature["temp"].unit == Unit.parse(unit)
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_limits_from_the_command_line(
     capsys: pytest.CaptureFixture[str], options: tuple[str, ...], margin: float, unit: str
 ) -> None:
     Path("s.stl").write_text(SPEC.format(unit="degC"), encoding="utf-8")
-    save_trace("t.csv", recorded(unit))
+    recorded(unit).save("t.csv")
     (hot,) = result(capsys, "s.stl", "t.csv", "--require", "hot", "--end", "truncate", *options)[
         "requirements"
     ]
@@ -122,7 +122,7 @@ def test_a_stream_is_judged_as_a_file(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, unit: str
 ) -> None:
     Path("s.stl").write_text(SPEC.format(unit="degC"), encoding="utf-8")
-    save_trace("t.csv", recorded(unit))
+    recorded(unit).save("t.csv")
     of_file = result(capsys, "s.stl", "t.csv")
     text = Path("t.csv").read_text(encoding="utf-8")
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(text.encode())))

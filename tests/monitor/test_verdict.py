@@ -18,7 +18,7 @@ from stlc.diagnostics import SpecError, StlcError, TraceError, UsageError
 from stlc.monitor.online.online import How
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
-from stlc.trace import Trace, TraceMeta, save_trace
+from stlc.trace import Trace, TraceMeta
 from stlc.units import Unit
 
 ROOT = Path(__file__).parents[2]
@@ -371,7 +371,7 @@ def test_as_the_documentation_has_it(tmp_path: Path) -> None:
     path = tmp_path / "trace.npz"
     signature = Signature(tuple(Column(name) for name in values))
     trace = Trace(signature, 0.1, given_signals)
-    save_trace(path, trace)
+    trace.save(path)
     for subject in (trace, path, str(path)):
         assert monitor.check(subject).robustness.tolist() == verdict.robustness.tolist()
 

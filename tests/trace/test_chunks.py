@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stlc.diagnostics import StlcError, TraceError
-from stlc.trace import Reading, load_trace
+from stlc.trace import Reading, Trace
 from stlc.trace.chunks import pieces
 
 TIMES = {
@@ -22,7 +22,7 @@ TIMES = {
 def test_pieces_are_the_whole(tmp_path: Path, kind: str, end: str) -> None:
     rows = [f"{t},{k % 5},gö" for k, t in enumerate(TIMES[kind])]
     (tmp_path / "a.csv").write_bytes(end.join(["\ufefft,x,wörd", *rows]).encode())
-    whole = load_trace(tmp_path / "a.csv")
+    whole = Trace.load(tmp_path / "a.csv")
     parts = list(pieces(tmp_path / "a.csv", 7, Reading()))
     assert [part.samples for part in parts] == [7, 7, 7, 2]
     assert list(parts[1].extras) == ["wörd"]
@@ -43,7 +43,7 @@ def test_a_clock_that_changes_between_pieces(tmp_path: Path, kind: str, row: str
 def test_a_step_that_rounded_times_of_the_first_piece_do_not_tell(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     path.write_text("t,x\n" + "".join(f"{k / 30:.3f},{k}\n" for k in range(9_000)))
-    whole = load_trace(path)
+    whole = Trace.load(path)
     with pytest.raises(TraceError) as caught:
         list(pieces(path, 5, Reading()))
     (found,) = caught.value.diagnostics
@@ -102,7 +102,7 @@ def test_pieces_of_several_traces_in_parquet(tmp_path: Path) -> None:
 @pytest.mark.parametrize("size", [1, 2, 3, 5])
 def test_pieces_of_vectors(tmp_path: Path, shape: tuple[int, ...], size: int) -> None:
     np.savez(tmp_path / "a.npz", t=np.arange(5.0), x=np.arange(np.prod(shape)).reshape(shape), y=np.zeros(5))
-    whole = load_trace(tmp_path / "a.npz")
+    whole = Trace.load(tmp_path / "a.npz")
     parts = list(pieces(tmp_path / "a.npz", size, Reading(dt=1.0)))
     assert all(part.data.keys() == whole.data.keys() for part in parts)
     for name, values in whole.data.items():
@@ -121,7 +121,7 @@ def test_a_piece_that_unpacks_to_much(tmp_path: Path, name: str, monkeypatch: py
     monkeypatch.setattr("stlc.trace.formats.registry._ROOM", 1_000_000)
     wide = np.zeros((4, 100_000)) if name == "wide" else np.array("a" * 400_000)
     np.savez_compressed(tmp_path / "a.npz", t=np.arange(4.0), x=np.ones(4), **{name: wide})
-    for read in (lambda path: load_trace(path), lambda path: list(pieces(path, 2, Reading()))):
+    for read in (lambda path: Trace.load(path), lambda path: list(pieces(path, 2, Reading()))):
         with pytest.raises(TraceError, match="unpacks to"):
             read(tmp_path / "a.npz")
 
@@ -129,7 +129,7 @@ def test_a_piece_that_unpacks_to_much(tmp_path: Path, name: str, monkeypatch: py
 def test_a_vector_of_too_many_components(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", t=np.arange(4.0), x=np.ones(4), wide=np.zeros((4, 5000)))
     with pytest.raises(TraceError, match="4 x 5000"):
-        load_trace(tmp_path / "a.npz")
+        Trace.load(tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize("late", ["1", "go"])
@@ -139,7 +139,7 @@ def test_a_column_holds_words_or_numbers_in_all_pieces(tmp_path: Path, late: str
     (tmp_path / "a.csv").write_text("\n".join(["t,mode", *rows]))
     found = []
     for read in (
-        lambda reading: [load_trace(tmp_path / "a.csv", reading)],
+        lambda reading: [Trace.load(tmp_path / "a.csv", reading)],
         lambda reading: list(pieces(tmp_path / "a.csv", 10, reading)),
     ):
         if late == "1":  # among words, numbers are words for themselves
@@ -159,7 +159,7 @@ def test_a_wrong_cell_of_a_piece_has_the_line_of_the_file(tmp_path: Path, before
     (tmp_path / "a.csv").write_text(before + "\n".join(["t,x", *rows]))
     found = []
     for read in (
-        lambda: load_trace(tmp_path / "a.csv"),
+        lambda: Trace.load(tmp_path / "a.csv"),
         lambda: list(pieces(tmp_path / "a.csv", 10, Reading())),
     ):
         with pytest.raises(TraceError) as caught:

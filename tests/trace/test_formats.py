@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from stlc.diagnostics import StlcError, TraceError
-from stlc.trace import Reading, load_trace, save_trace
+from stlc.trace import Reading, Trace
 from stlc.trace.chunks import pieces
 from stlc.trace.formats.mat import read
 
@@ -55,13 +55,13 @@ uint32 nanosec
 
 def code_of(path: Path, reading: Reading | None = None) -> str:
     with pytest.raises(StlcError) as caught:
-        load_trace(path, *([reading] if reading else []))
+        Trace.load(path, *([reading] if reading else []))
     return caught.value.diagnostics[0].code
 
 
 def message_of(path: Path) -> str:
     with pytest.raises(StlcError) as caught:
-        load_trace(path)
+        Trace.load(path)
     return str(caught.value)
 
 
@@ -84,7 +84,7 @@ def a_parquet(path: Path) -> Path:
 
 
 def test_parquet(tmp_path: Path) -> None:
-    trace = load_trace(a_parquet(tmp_path / "a.parquet"))
+    trace = Trace.load(a_parquet(tmp_path / "a.parquet"))
     assert list(trace.data) == ["x", "v", "on", "q[0]", "q[1]"]
     assert (trace.dt, trace.samples, trace.traces) == (0.1, N, 1)
     np.testing.assert_array_equal(trace.data["v"][0], X)
@@ -99,13 +99,13 @@ def test_words_of_parquet(tmp_path: Path, encoded: bool) -> None:
     column = words.dictionary_encode() if encoded else words
     table = pa.table({"t": [0.0, 0.1, 0.2, 0.3], "x": [1.0, 2.0, 3.0, 4.0], "sign": column, "why": column})
     parquet.write_table(table, tmp_path / "a.parquet", row_group_size=3)
-    assert load_trace(tmp_path / "a.parquet").extras["sign"].tolist() == ["go", "", "Stop", "x" * 64]
+    assert Trace.load(tmp_path / "a.parquet").extras["sign"].tolist() == ["go", "", "Stop", "x" * 64]
     members = {"go": 0.0, "stop": 2.0, "": 1.0, "x" * 64: 3.0}
-    trace = load_trace(tmp_path / "a.parquet", Reading(words={"sign": members, "x": {}}))
+    trace = Trace.load(tmp_path / "a.parquet", Reading(words={"sign": members, "x": {}}))
     assert trace.data["sign"].tolist() == [[0.0, 1.0, 2.0, 3.0]]
     assert list(trace.extras) == ["why"]
     with pytest.raises(TraceError, match="cannot be `x"):
-        load_trace(tmp_path / "a.parquet", Reading(words={"sign": {"go": 0.0, "stop": 2.0, "": 1.0}}))
+        Trace.load(tmp_path / "a.parquet", Reading(words={"sign": {"go": 0.0, "stop": 2.0, "": 1.0}}))
 
 
 def test_parquet_times_and_traces(tmp_path: Path) -> None:
@@ -113,7 +113,7 @@ def test_parquet_times_and_traces(tmp_path: Path) -> None:
     both = pa.chunked_array([stamps, stamps])
     table = pa.table({"t": both, "trace": [0] * 4 + [1] * 4, "x": list(range(8)), "hole": [None, *range(7)]})
     parquet.write_table(table, tmp_path / "a.parquet")
-    trace = load_trace(tmp_path / "a.parquet")
+    trace = Trace.load(tmp_path / "a.parquet")
     assert (trace.dt, trace.t0, trace.traces, trace.samples) == (0.01, 0.0, 2, 4)
     assert trace.data["x"].tolist() == [[0, 1, 2, 3], [4, 5, 6, 7]]
     assert np.isnan(trace.data["hole"][0, 0])
@@ -151,7 +151,7 @@ def test_words_and_lists_that_unpack_to_much(
 
 def load_refused(path: Path) -> str | None:
     try:
-        load_trace(path)
+        Trace.load(path)
     except StlcError as error:
         return error.diagnostics[0].code
     return None
@@ -165,7 +165,7 @@ def test_a_word_is_unpacked_once(tmp_path: Path) -> None:
     usual, watched = pa.default_memory_pool(), pa.system_memory_pool()  # which nothing else uses
     pa.set_memory_pool(watched)
     try:
-        assert load_trace(tmp_path / "a.parquet").extras["word"].tolist() == ["w" * 64] * 10_000
+        assert Trace.load(tmp_path / "a.parquet").extras["word"].tolist() == ["w" * 64] * 10_000
     finally:
         pa.set_memory_pool(usual)
     assert watched.max_memory() < 10_000_000
@@ -188,7 +188,7 @@ def a_mat5(path: Path, *, compressed: bool = True) -> Path:
 @pytest.mark.parametrize("compressed", [True, False])
 def test_mat5(tmp_path: Path, compressed: bool) -> None:
     path = a_mat5(tmp_path / "a.mat", compressed=compressed)
-    trace = load_trace(path)
+    trace = Trace.load(path)
     assert set(trace.data) == {"x", "on", "q[0]", "q[1]", "many", "s.y", "s.inner.z", "n"}
     assert (trace.dt, trace.samples, trace.traces) == (0.1, N, 2)
     np.testing.assert_array_equal(trace.data["x"], [X, X])
@@ -207,7 +207,7 @@ def test_mat5_of_the_other_byte_order(tmp_path: Path) -> None:
     body = matrix("t", T) + matrix("x", X)
     path = tmp_path / "a.mat"
     path.write_bytes(b"MATLAB 5.0".ljust(124) + b"\x01\x00MI" + body)
-    np.testing.assert_array_equal(load_trace(path).data["x"][0], X)
+    np.testing.assert_array_equal(Trace.load(path).data["x"][0], X)
 
 
 def test_mat5_that_declares_more_than_it_holds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -245,7 +245,7 @@ def a_mat73(path: Path) -> Path:
 
 
 def test_mat73(tmp_path: Path) -> None:
-    trace = load_trace(a_mat73(tmp_path / "a.mat"))
+    trace = Trace.load(a_mat73(tmp_path / "a.mat"))
     assert set(trace.data) == {"x", "q[0]", "q[1]", "s.y"}
     np.testing.assert_array_equal(trace.data["q[1]"][0], -X)
 
@@ -259,7 +259,7 @@ def test_mat73_that_declares_more_than_it_holds(tmp_path: Path) -> None:
 def test_mat_of_no_version(tmp_path: Path) -> None:
     (tmp_path / "a.mat").write_bytes(b"hello")
     with pytest.raises(StlcError) as caught:
-        load_trace(tmp_path / "a.mat")
+        Trace.load(tmp_path / "a.mat")
     assert "save FILE -v7" in caught.value.diagnostics[0].help[0]
     (tmp_path / "b.mat").write_bytes(b"")
     assert "empty" in message_of(tmp_path / "b.mat")
@@ -283,7 +283,7 @@ def test_complex_numbers_are_refused_where_a_signal_needs_them(tmp_path: Path, v
     np.testing.assert_array_equal(arrays["flat"], X)
     assert "imag" in read(path).refused["z"]
     with pytest.raises(TraceError):
-        load_trace(path, Reading({"y": "z"}, words={"y": {}}))
+        Trace.load(path, Reading({"y": "z"}, words={"y": {}}))
 
 
 # ------------------------------------------------------------------------------- bags
@@ -313,7 +313,7 @@ def a_bag(path: Path) -> Path:
 def test_a_bag_is_resampled(tmp_path: Path) -> None:
     path = a_bag(tmp_path / "a.mcap")
     assert code_of(path) == "E602"
-    trace = load_trace(path, Reading(names={"x": "robot.pose.position.x"}, resample=0.1))
+    trace = Trace.load(path, Reading(names={"x": "robot.pose.position.x"}, resample=0.1))
     assert set(trace.data) >= {"x", "robot.pose.position.y", "robot.pose.ok", "robot.pose.cov[2]", "on"}
     assert not any("header" in name for name in trace.data)
     assert (trace.samples, trace.t0) == (N, 0.0)
@@ -336,17 +336,17 @@ def test_what_is_discrete_is_held_and_real_numbers_run_straight(tmp_path: Path) 
     x = np.array([0.0, 1.0, 2.5, 4.0, 5.0])
     np.savez(path, t=t, x=x, on=np.array([0, 0, 1, 1, 0], dtype=bool), mode=np.array([3.0, 1, 2, 2, 0]))
     assert code_of(path) == "E602"
-    trace = load_trace(path, Reading(resample=0.1, kinds={"mode": "enum"}))
+    trace = Trace.load(path, Reading(resample=0.1, kinds={"mode": "enum"}))
     np.testing.assert_allclose(trace.data["x"][0], np.arange(6.0), atol=1e-12)
     assert trace.data["on"][0].tolist() == [0, 0, 0, 1, 1, 0]
     assert trace.data["mode"][0].tolist() == [3, 1, 1, 2, 2, 0]
-    assert load_trace(path, Reading(resample=0.05)).samples == 11
+    assert Trace.load(path, Reading(resample=0.05)).samples == 11
 
 
 def test_resampling_on_the_own_grid_changes_nothing(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     np.savez(tmp_path / "a.npz", t=0.3 + T, x=rng.normal(size=(3, N)))
-    plain, again = load_trace(tmp_path / "a.npz"), load_trace(tmp_path / "a.npz", Reading(resample=0.1))
+    plain, again = Trace.load(tmp_path / "a.npz"), Trace.load(tmp_path / "a.npz", Reading(resample=0.1))
     np.testing.assert_allclose(again.data["x"], plain.data["x"], atol=1e-12)
     assert again.samples == plain.samples
 
@@ -362,10 +362,10 @@ def test_clocks_that_cannot_be_resampled(tmp_path: Path, t: list[float], code: s
 
 def test_the_clock_may_have_another_name(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", time=T, x=X)
-    assert list(load_trace(tmp_path / "a.npz").data) == ["x"]
+    assert list(Trace.load(tmp_path / "a.npz").data) == ["x"]
     np.savez(tmp_path / "a.npz", now=T, x=X)
     assert code_of(tmp_path / "a.npz") == "E601"
-    trace = load_trace(tmp_path / "a.npz", Reading(names={"t": "now", "y": "x"}))
+    trace = Trace.load(tmp_path / "a.npz", Reading(names={"t": "now", "y": "x"}))
     assert list(trace.data) == ["y"]
     assert code_of(tmp_path / "a.npz", Reading(names={"t": "clock"})) == "E601"
 
@@ -435,7 +435,7 @@ def test_damaged_files_give_traces_or_diagnostics(form: str, tmp_path: Path) -> 
         path.write_bytes(damaged(raw, rng))
         for reading in (Reading(), Reading(resample=0.1)):
             try:
-                load_trace(path, reading)
+                Trace.load(path, reading)
             except StlcError as error:
                 assert error.diagnostics  # noqa: PT017
                 refused += 1
@@ -447,19 +447,19 @@ def test_a_missing_package_is_named(form: str, tmp_path: Path, monkeypatch: pyte
     path = MAKERS[form](tmp_path / f"a.{form}")
     package = {"parquet": "pyarrow.parquet", "v73.mat": "h5py"}.get(form)
     if package is None and not form.endswith(("mcap", "bag", "db3")):
-        assert load_trace(path).samples == N
+        assert Trace.load(path).samples == N
         return
     if package is None:
         return
     monkeypatch.setitem(__import__("sys").modules, package, None)
     with pytest.raises(StlcError) as caught:
-        load_trace(path)
+        Trace.load(path)
     (finding,) = caught.value.diagnostics
     assert finding.code == "R301"
     assert finding.help[0].startswith("pip install ")
 
 
 def test_writing_stays_with_npz_and_csv(tmp_path: Path) -> None:
-    trace = load_trace(a_csv(tmp_path / "a.csv"))
-    save_trace(tmp_path / "b.npz", trace)
-    np.testing.assert_array_equal(load_trace(tmp_path / "b.npz").data["x"], trace.data["x"])
+    trace = Trace.load(a_csv(tmp_path / "a.csv"))
+    trace.save(tmp_path / "b.npz")
+    np.testing.assert_array_equal(Trace.load(tmp_path / "b.npz").data["x"], trace.data["x"])

@@ -13,7 +13,7 @@ import pytest
 
 from stlc.diagnostics import StlcError
 from stlc.signature import Column, Signature
-from stlc.trace import Reading, Trace, TraceMeta, load_trace, save_trace
+from stlc.trace import Reading, Trace, TraceMeta
 from stlc.units import Unit
 
 writers = pytest.importorskip("mcap.writer")
@@ -24,7 +24,7 @@ X = np.sin(np.arange(21) / 10)
 
 def message_of(path: Path) -> str:
     with pytest.raises(StlcError) as caught:
-        load_trace(path)
+        Trace.load(path)
     return str(caught.value)
 
 
@@ -47,8 +47,8 @@ def a_log(
 def test_json(tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_bytes(robot_logs.json_mcap(X.tolist()))
     (tmp_path / "b.mcap").write_bytes((tmp_path / "a.mcap").read_bytes()[:-60])  # without all of its index
-    assert load_trace(tmp_path / "b.mcap").samples == 21
-    trace = load_trace(tmp_path / "a.mcap")
+    assert Trace.load(tmp_path / "b.mcap").samples == 21
+    trace = Trace.load(tmp_path / "a.mcap")
     assert (trace.dt, trace.samples, trace.meta.origin) == (0.1, 21, robot_logs.START)
     np.testing.assert_array_equal(trace.data["robot.state.position.x"][0], X)
     assert set(trace.data) == {
@@ -62,7 +62,7 @@ def test_json(tmp_path: Path) -> None:
 def test_json_that_is_odd(tmp_path: Path, text: bytes) -> None:
     path = a_log(tmp_path / "a.mcap", ("json", "jsonschema"), b"{}", [(0, text), (10**9, text)])
     if b"999" in text:
-        assert np.isinf(load_trace(path).data["state.x"]).all()
+        assert np.isinf(Trace.load(path).data["state.x"]).all()
     else:
         assert message_of(path).startswith("E603")
 
@@ -70,7 +70,7 @@ def test_json_that_is_odd(tmp_path: Path, text: bytes) -> None:
 def test_messages_out_of_order_and_times_that_are_none(tmp_path: Path) -> None:
     messages = [(k * 10**8, json.dumps({"data": k}).encode()) for k in (1, 0, 3, 2)]
     path = a_log(tmp_path / "a.mcap", ("json", "jsonschema"), b"{}", messages)
-    assert load_trace(path).data["state"].tolist() == [[0.0, 1.0, 2.0, 3.0]]
+    assert Trace.load(path).data["state"].tolist() == [[0.0, 1.0, 2.0, 3.0]]
     late = a_log(tmp_path / "b.mcap", ("json", ""), b"", [(2**63, b"{}"), (2**64 - 1, b"{}")])
     assert "which is no time" in message_of(late)
 
@@ -100,7 +100,7 @@ def test_protocol_buffers(tmp_path: Path) -> None:
         )
         for k, x in enumerate(X.tolist())
     ]
-    trace = load_trace(a_log(tmp_path / "a.mcap", ("protobuf", "protobuf"), schema, messages))
+    trace = Trace.load(a_log(tmp_path / "a.mcap", ("protobuf", "protobuf"), schema, messages))
     np.testing.assert_array_equal(trace.data["state.x"][0], X)
     assert set(trace.data) == {"state.x", "state.q[0]", "state.q[1]", "state.at"}
     assert trace.data["state.at"][0, 0] == 5.0
@@ -116,7 +116,7 @@ def test_what_is_not_read_is_named(tmp_path: Path) -> None:
 def test_messages_of_ros_1(tmp_path: Path) -> None:
     messages = [(k * 10**8, robot_logs.message(x, k)) for k, x in enumerate(X.tolist())]
     path = a_log(tmp_path / "a.mcap", ("ros1", "ros1msg"), robot_logs.DEFINITION.encode(), messages)
-    np.testing.assert_array_equal(load_trace(path).data["state.position.x"][0], X)
+    np.testing.assert_array_equal(Trace.load(path).data["state.position.x"][0], X)
 
 
 def test_a_chunk_that_was_changed_or_unpacks_without_end(tmp_path: Path) -> None:
@@ -145,8 +145,8 @@ def test_what_is_written_is_read_again(tmp_path: Path, traces: int) -> None:
     data = {"keep gap": x, "mode": np.ones((traces, 8)), "q[0]": -x}
     meta = TraceMeta("traffic", seed=3, dt=1 / 30, origin=robot_logs.START)
     trace = Trace(columns, 1 / 30, data, -0.5, meta=meta)
-    save_trace(tmp_path / "margins.mcap", trace)
-    back = load_trace(tmp_path / "margins.mcap")
+    trace.save(tmp_path / "margins.mcap")
+    back = Trace.load(tmp_path / "margins.mcap")
     assert (back.signature, back.dt, back.meta, back.t0) == (columns, 1 / 30, meta, -0.5)
     assert all(np.array_equal(back.data[name], data[name], equal_nan=True) for name in data)
 
@@ -154,9 +154,7 @@ def test_what_is_written_is_read_again(tmp_path: Path, traces: int) -> None:
 def test_others_find_messages_of_json_with_a_schema(tmp_path: Path) -> None:
     data = {"r": np.array([[1.0, np.nan], [2.0, np.inf]])}
     meta = TraceMeta(origin=robot_logs.START)
-    save_trace(
-        tmp_path / "my margins.mcap", Trace(Signature((Column("r", Unit.parse("m")),)), 0.1, data, meta=meta)
-    )
+    Trace(Signature((Column("r", Unit.parse("m")),)), 0.1, data, meta=meta).save(tmp_path / "my margins.mcap")
     reader = pytest.importorskip("mcap.reader").make_reader(
         io.BytesIO((tmp_path / "my margins.mcap").read_bytes())
     )
@@ -176,12 +174,12 @@ def test_others_find_messages_of_json_with_a_schema(tmp_path: Path) -> None:
 
 
 def test_a_record_of_ours_that_lies(tmp_path: Path) -> None:
-    save_trace(tmp_path / "a.mcap", Trace(Signature((Column("r"),)), 0.1, {"r": np.zeros((1, 3))}))
+    Trace(Signature((Column("r"),)), 0.1, {"r": np.zeros((1, 3))}).save(tmp_path / "a.mcap")
     raw = (tmp_path / "a.mcap").read_bytes()
     for old, new in ((b'["/a"]', b'["/b"]'), (b'["/a"]', b'[["a"]'), (b'{"spec_name"', b'["spec_name"')):
         (tmp_path / "b.mcap").write_bytes(raw.replace(old, new))
         try:
-            assert load_trace(tmp_path / "b.mcap", Reading()).samples == 3
+            assert Trace.load(tmp_path / "b.mcap", Reading()).samples == 3
         except StlcError as error:
             assert error.diagnostics[0].code == "E603"  # noqa: PT017
 
@@ -194,16 +192,16 @@ def test_the_fields_of_a_time_stamp_may_have_any_order(
     values = dict(zip(("sec", "nanosec"), zip(names, (3, 500_000_000), strict=True), strict=True))
     text = json.dumps({"st": dict(values[each] for each in order)}).encode()
     path = a_log(tmp_path / "a.mcap", ("json", "jsonschema"), b"{}", [(0, text), (10**9, text)])
-    assert load_trace(path).data["state.st"].tolist() == [[3.5, 3.5]]
+    assert Trace.load(path).data["state.st"].tolist() == [[3.5, 3.5]]
 
 
 def test_a_time_stamp_that_is_no_number(tmp_path: Path) -> None:
     text = b'{"st": {"sec": 1e999, "nanosec": -1e999}}'
     path = a_log(tmp_path / "a.mcap", ("json", "jsonschema"), b"{}", [(0, text), (10**9, text)])
-    assert np.isnan(load_trace(path).data["state.st"]).all()
+    assert np.isnan(Trace.load(path).data["state.st"]).all()
 
 
 def test_names_that_utf_8_cannot_encode_are_replaced(tmp_path: Path) -> None:
     text = b'{"x\\ud800": 1}'
     path = a_log(tmp_path / "a.mcap", ("json", "jsonschema"), b"{}", [(0, text), (10**9, text)])
-    assert [*load_trace(path).data] == ["state.x\ufffd"]
+    assert [*Trace.load(path).data] == ["state.x\ufffd"]

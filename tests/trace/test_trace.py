@@ -18,7 +18,7 @@ from hypothesis.extra import numpy as hnp
 
 from stlc.diagnostics import StlcError, TraceError, UsageError
 from stlc.signature import Column, Signature
-from stlc.trace import Reading, Trace, TraceMeta, as_fraction, load_trace, save_trace
+from stlc.trace import Reading, Trace, TraceMeta, as_fraction
 from stlc.trace.enums import TRUTH
 from stlc.trace.formats import csv as trace_csv
 from stlc.trace.formats.npz import read as read_npz
@@ -45,13 +45,13 @@ def a_trace(x: np.ndarray | None = None) -> Trace:
 
 def code_of(path: Path) -> str:
     with pytest.raises(StlcError) as caught:
-        load_trace(path)
+        Trace.load(path)
     return caught.value.diagnostics[0].code
 
 
 def message_of(path: Path) -> str:
     with pytest.raises(StlcError) as caught:
-        load_trace(path)
+        Trace.load(path)
     return caught.value.diagnostics[0].message
 
 
@@ -81,8 +81,8 @@ def header(shape: tuple[int, ...], descr: str = "<f8") -> bytes:
 @pytest.mark.parametrize("suffix", [".npz", ".csv"])
 def test_round_trip_keeps_every_bit(tmp_path: Path, suffix: str, x: np.ndarray) -> None:
     path = tmp_path / f"a{suffix}"
-    save_trace(path, a_trace(x))
-    back = load_trace(path)
+    a_trace(x).save(path)
+    back = Trace.load(path)
     assert list(back.data) == ["x", "sign", "q[0]"]
     assert all(np.array_equal(back.data[name], a_trace(x).data[name]) for name in back.data)
     assert (back.dt, back.t0, back.traces, back.samples) == (0.1, 0.5, *x.shape)
@@ -90,8 +90,8 @@ def test_round_trip_keeps_every_bit(tmp_path: Path, suffix: str, x: np.ndarray) 
 
 
 def test_npz_keeps_columns_extras_and_meta(tmp_path: Path) -> None:
-    save_trace(tmp_path / "a.npz", a_trace())
-    back = load_trace(tmp_path / "a.npz")
+    a_trace().save(tmp_path / "a.npz")
+    back = Trace.load(tmp_path / "a.npz")
     assert back.signature == SIGNATURE
     assert back.meta == a_trace().meta
     assert back.extras["decision"].tolist() == [[0, 1, 2]]
@@ -99,13 +99,13 @@ def test_npz_keeps_columns_extras_and_meta(tmp_path: Path) -> None:
 
 
 def test_the_same_trace_gives_the_same_bytes(tmp_path: Path) -> None:
-    save_trace(tmp_path / "a.npz", a_trace())
-    save_trace(tmp_path / "b.npz", a_trace())
+    a_trace().save(tmp_path / "a.npz")
+    a_trace().save(tmp_path / "b.npz")
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
 def test_numpy_can_read_what_we_write(tmp_path: Path) -> None:
-    save_trace(tmp_path / "a.npz", a_trace())
+    a_trace().save(tmp_path / "a.npz")
     with np.load(tmp_path / "a.npz", allow_pickle=False) as arrays:
         assert np.allclose(arrays["t"], 0.5 + 0.1 * np.arange(6))
         assert arrays["x"].shape == (2, 6)
@@ -113,11 +113,11 @@ def test_numpy_can_read_what_we_write(tmp_path: Path) -> None:
 
 def test_a_failed_save_leaves_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
-    save_trace(path, a_trace())
+    a_trace().save(path)
     old = path.read_bytes()
     broken = replace(a_trace(), extras={"objects": np.array([object()])})
     with pytest.raises(ValueError, match="Object arrays"):
-        save_trace(path, broken)
+        broken.save(path)
     assert path.read_bytes() == old
     assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
 
@@ -126,7 +126,7 @@ def test_a_failed_save_leaves_the_old_file(tmp_path: Path) -> None:
 def test_reserved_names_are_refused(tmp_path: Path, name: str) -> None:
     trace = replace(a_trace(), signature=Signature((Column(name),)), data={name: np.zeros((1, 3))})
     with pytest.raises(TraceError, match="cannot be called"):
-        save_trace(tmp_path / "a.npz", trace)
+        trace.save(tmp_path / "a.npz")
 
 
 def test_shapes_and_dtypes_that_are_accepted(tmp_path: Path) -> None:
@@ -139,7 +139,7 @@ def test_shapes_and_dtypes_that_are_accepted(tmp_path: Path) -> None:
         p=np.zeros((3, 4, 2), np.float32),
         r=np.asfortranarray(np.arange(12.0).reshape(3, 4)),
     )
-    trace = load_trace(path)
+    trace = Trace.load(path)
     assert (trace.traces, trace.samples, trace.dt) == (3, 4, 0.1)
     assert list(trace.data) == ["one", "flag", "p[0]", "p[1]", "r"]
     assert trace.data["r"][2].tolist() == [8, 9, 10, 11]
@@ -174,7 +174,7 @@ def test_an_array_of_objects_is_not_unpickled(tmp_path: Path, monkeypatch: pytes
     path = npz(tmp_path / "a.npz", t=np.arange(3) * 0.1, v=np.zeros(3), x=objects)
     assert "Python objects" in read_npz(path).refused["x"]
     with pytest.raises(TraceError):
-        load_trace(path, Reading({"y": "x"}, words={"y": {}}))
+        Trace.load(path, Reading({"y": "x"}, words={"y": {}}))
     assert not Path("owned").exists()
 
 
@@ -220,9 +220,9 @@ def test_a_zip_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, monkeypatch
 def test_a_small_archive_that_unpacks_to_a_large_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.npz"
     np.savez_compressed(path, t=np.arange(1_000_000.0), x=np.zeros(1_000_000))
-    assert load_trace(path).samples == 1_000_000
+    assert Trace.load(path).samples == 1_000_000
     monkeypatch.setattr("stlc.trace.formats.registry._ROOM", 1_000_000)
-    assert load_trace(path).samples == 1_000_000, "what is not all alike is packed far less"
+    assert Trace.load(path).samples == 1_000_000, "what is not all alike is packed far less"
     np.savez_compressed(path, t=np.zeros(1_000_000), x=np.zeros(1_000_000))
     assert "unpacks to" in message_of(path)
 
@@ -257,7 +257,7 @@ def test_malicious_headers(tmp_path: Path, nested: bytes) -> None:
 def outcome(path: Path) -> str:
     """ "read", or the code of the diagnostic; every other exception fails the test."""
     try:
-        return "read" if load_trace(path).samples > 0 else "nothing"
+        return "read" if Trace.load(path).samples > 0 else "nothing"
     except StlcError as error:
         return error.diagnostics[0].code
 
@@ -278,7 +278,7 @@ def damaged(data: bytes, cut: int, flips: list[tuple[int, int]]) -> bytes:
 def test_damage_is_a_diagnostic_or_harmless(tmp_path: Path, cut: int, flips: list[tuple[int, int]]) -> None:
     whole = tmp_path / "whole.npz"
     if not whole.exists():
-        save_trace(whole, a_trace())
+        a_trace().save(whole)
     path = tmp_path / "damaged.npz"
     path.write_bytes(damaged(whole.read_bytes(), cut, flips))
     assert outcome(path) in ("read", "E601", "E602", "E603", "E604", "E605")
@@ -286,7 +286,7 @@ def test_damage_is_a_diagnostic_or_harmless(tmp_path: Path, cut: int, flips: lis
 
 @pytest.mark.parametrize("cut", [1, 30, 400])
 def test_a_truncated_file(tmp_path: Path, cut: int) -> None:
-    save_trace(tmp_path / "a.npz", a_trace())
+    a_trace().save(tmp_path / "a.npz")
     (tmp_path / "a.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:-cut])
     assert code_of(tmp_path / "a.npz") == "E603"
 
@@ -313,7 +313,7 @@ def test_damaged_meta(tmp_path: Path, meta: np.ndarray) -> None:
 def test_missing_file_and_folder(tmp_path: Path) -> None:
     for path in (tmp_path / "none.npz", tmp_path / "none.csv", tmp_path):
         with pytest.raises(UsageError):
-            load_trace(path)
+            Trace.load(path)
 
 
 def test_a_packed_array_that_is_damaged(tmp_path: Path) -> None:
@@ -321,7 +321,7 @@ def test_a_packed_array_that_is_damaged(tmp_path: Path) -> None:
         with zipfile.ZipFile(tmp_path / "a.npz", "w", method) as archive:
             for name in ("t", "x"):
                 archive.writestr(f"{name}.npy", header((200,)) + np.arange(200.0).tobytes())
-        assert load_trace(tmp_path / "a.npz").samples == 200
+        assert Trace.load(tmp_path / "a.npz").samples == 200
         raw = (tmp_path / "a.npz").read_bytes()
         for at in range(36, 120, 7):
             (tmp_path / "b.npz").write_bytes(raw[:at] + bytes([raw[at] ^ 255]) + raw[at + 1 :])
@@ -363,7 +363,7 @@ def test_arrays_that_do_not_fit(tmp_path: Path, arrays: dict[str, object], code:
     path = npz(tmp_path / "a.npz", **arrays)
     assert code_of(path) == code
     with pytest.raises(TraceError, match=words):
-        load_trace(path)
+        Trace.load(path)
 
 
 def test_a_slow_drift_is_not_uniform(tmp_path: Path) -> None:
@@ -375,7 +375,7 @@ def test_a_slow_drift_is_not_uniform(tmp_path: Path) -> None:
 @pytest.mark.parametrize("dt", [0.1, 1 / 30, 0.004, 1e-6, 2.0])
 def test_the_step_is_the_fraction_that_was_meant(tmp_path: Path, dt: float) -> None:
     times = 3 + np.cumsum(np.full(1000, dt))
-    trace = load_trace(npz(tmp_path / "a.npz", t=times, x=np.zeros(1000)))
+    trace = Trace.load(npz(tmp_path / "a.npz", t=times, x=np.zeros(1000)))
     assert trace.dt == pytest.approx(dt, rel=1e-12)
     assert as_fraction(trace.dt).denominator <= 1_000_000
 
@@ -388,7 +388,7 @@ def test_a_step_that_nothing_is_sampled_with(tmp_path: Path, dt: float) -> None:
         path = npz(tmp_path / "b.npz", x=np.zeros(5), t=np.arange(5) * dt)
         assert (code_of(path), message_of(path)[:17]) == ("E602", "the time step of ")
     with pytest.raises(TraceError, match="E602: the time step of"):
-        load_trace(npz(tmp_path / "c.npz", x=np.zeros(5), t=np.arange(5)), Reading(resample=dt))
+        Trace.load(npz(tmp_path / "c.npz", x=np.zeros(5), t=np.arange(5)), Reading(resample=dt))
 
 
 def test_fractions_of_steps() -> None:
@@ -408,7 +408,7 @@ def csv(path: Path, text: str) -> Path:
 def test_csv_with_units_agents_and_blanks(tmp_path: Path) -> None:
     text = "\ufeff t ; agent ; v [km/h]; q[0] [rad]\r\n0;7;1;2\r\n0.5;7;3;4\r\n\r\n0;9;5;true\r\n"
     text += "0.5;9;-.5e1;0\r\n"
-    trace = load_trace(csv(tmp_path / "a.csv", text))
+    trace = Trace.load(csv(tmp_path / "a.csv", text))
     assert (trace.dt, trace.traces, trace.samples) == (0.5, 2, 2)
     assert trace.data["v"].tolist() == [[1, 3], [5, -5]]
     assert trace.data["q[0]"].tolist() == [[2, 4], [1, 0]]
@@ -416,7 +416,7 @@ def test_csv_with_units_agents_and_blanks(tmp_path: Path) -> None:
 
 
 def test_csv_lines_of_agents_may_alternate(tmp_path: Path) -> None:
-    trace = load_trace(csv(tmp_path / "a.csv", "t,trace,x\n0,0,1\n0,1,2\n1,0,3\n1,1,4\n"))
+    trace = Trace.load(csv(tmp_path / "a.csv", "t,trace,x\n0,0,1\n0,1,2\n1,0,3\n1,1,4\n"))
     assert trace.data["x"].tolist() == [[1, 3], [2, 4]]
 
 
@@ -453,7 +453,7 @@ def test_csv_that_is_wrong(
     tmp_path: Path, text: str, code: str, place: tuple[int, int] | None, words: str
 ) -> None:
     with pytest.raises(StlcError) as caught:
-        load_trace(csv(tmp_path / "a.csv", text))
+        Trace.load(csv(tmp_path / "a.csv", text))
     finding = caught.value.diagnostics[0]
     assert finding.code == code
     assert all(part in finding.message for part in words.split(".*"))
@@ -462,7 +462,7 @@ def test_csv_that_is_wrong(
 
 def test_csv_reports_the_first_bad_cell_of_each_column(tmp_path: Path) -> None:
     with pytest.raises(TraceError) as caught:
-        load_trace(csv(tmp_path / "a.csv", "t,x,y\n0,1,2\n1,a,b\n1,2,c\n"))
+        Trace.load(csv(tmp_path / "a.csv", "t,x,y\n0,1,2\n1,a,b\n1,2,c\n"))
     first, second = caught.value.diagnostics
     assert [d.message.split("`")[1] for d in (first, second)] == ["a", "b"]
     assert second.note == ("1 more cell of `y` not a number",)
@@ -486,7 +486,7 @@ def test_clocks_as_others_write_them(tmp_path: Path, head: str, times: str) -> N
         f"{head},Speed over Ground (km/h),f(x)",
         *(f"{time},{k},0" for k, time in enumerate(times.split())),
     ]
-    trace = load_trace(csv(tmp_path / "a.csv", "\n".join(lines)))
+    trace = Trace.load(csv(tmp_path / "a.csv", "\n".join(lines)))
     assert (trace.t0, trace.dt, trace.samples) == (0.0, 0.5, 3)
     assert list(trace.data) == ["Speed over Ground", "f(x)"]
     assert trace.signature["Speed over Ground"].unit.text == "km/h"
@@ -494,7 +494,7 @@ def test_clocks_as_others_write_them(tmp_path: Path, head: str, times: str) -> N
 
 @pytest.mark.parametrize("cells", ["0,5", "-1,25e1"])
 def test_decimal_commas_between_semicolons(tmp_path: Path, cells: str) -> None:
-    trace = load_trace(csv(tmp_path / "a.csv", f"t;x\n0,0;{cells}\n0,5;1\n"))
+    trace = Trace.load(csv(tmp_path / "a.csv", f"t;x\n0,0;{cells}\n0,5;1\n"))
     assert trace.dt == 0.5
     assert trace.data["x"].tolist() == [[float(cells.replace(",", ".")), 1.0]]
     assert code_of(csv(tmp_path / "a.csv", f"t;x\n0,0;1\n0,5;{cells},\n")) == "E603"
@@ -502,8 +502,8 @@ def test_decimal_commas_between_semicolons(tmp_path: Path, cells: str) -> None:
 
 def test_another_clock_than_the_usual_one(tmp_path: Path) -> None:
     path = csv(tmp_path / "a.csv", "time,stamp,x\n0,5,1\n1,5.5,2\n")
-    assert load_trace(path, Reading({"t": "time"})).dt == 1.0
-    trace = load_trace(path, Reading({"t": "stamp"}))
+    assert Trace.load(path, Reading({"t": "time"})).dt == 1.0
+    trace = Trace.load(path, Reading({"t": "stamp"}))
     assert (trace.t0, trace.dt) == (5.0, 0.5)
     assert set(trace.data) == {"x", "time"}
 
@@ -521,17 +521,17 @@ WORDS = {"sign": {"stop": 0.0, "light": 1.0}, "on": TRUTH, "x": {}}
     ],
 )
 def test_an_empty_cell_is_no_number_and_an_empty_line_is_none(tmp_path: Path, text: str) -> None:
-    trace = load_trace(csv(tmp_path / "a.csv", text))
+    trace = Trace.load(csv(tmp_path / "a.csv", text))
     np.testing.assert_array_equal(trace.data["x"], [[1.0, np.nan, 4.0]])
     np.testing.assert_array_equal(trace.data["y"], [[2.0, 3.0, np.nan]])
 
 
 def test_a_column_of_words_may_begin_with_an_empty_cell(tmp_path: Path) -> None:
     path = csv(tmp_path / "a.csv", "t,Sign,x\n0,,1\n1,stop,\n2,,3\n")
-    trace = load_trace(path)
+    trace = Trace.load(path)
     assert trace.extras["Sign"].tolist() == ["", "stop", ""]
     np.testing.assert_array_equal(trace.data["x"], [[1.0, np.nan, 3.0]])
-    read = load_trace(path, Reading({"sign": "Sign"}, words=WORDS)).data["sign"][0]
+    read = Trace.load(path, Reading({"sign": "Sign"}, words=WORDS)).data["sign"][0]
     assert read.tolist()[1] == WORDS["sign"]["stop"]
     assert np.isnan(read[[0, 2]]).all()
 
@@ -539,7 +539,7 @@ def test_a_column_of_words_may_begin_with_an_empty_cell(tmp_path: Path) -> None:
 @pytest.mark.parametrize("quote", ["", '"'])
 def test_long_words_are_cut(tmp_path: Path, quote: str) -> None:
     path = csv(tmp_path / "a.csv", f"t,x,note\n0,1,{quote}ok{quote}\n1,2,{quote}{'a' * 5000}{quote}\n")
-    note = load_trace(path).extras["note"]
+    note = Trace.load(path).extras["note"]
     assert note.tolist() == ["ok", "a" * 64]
     assert note.dtype.itemsize == 4 * 64
 
@@ -553,7 +553,7 @@ def test_traces_whose_names_may_have_been_cut_are_refused(tmp_path: Path) -> Non
 
 def test_without_a_clock_the_arrays_are_named(tmp_path: Path) -> None:
     with pytest.raises(TraceError) as caught:
-        load_trace(csv(tmp_path / "a.csv", "when,x\n0,1\n1,2\n"))
+        Trace.load(csv(tmp_path / "a.csv", "when,x\n0,1\n1,2\n"))
     (finding,) = caught.value.diagnostics
     assert finding.message.endswith("has no `t`")
     assert finding.note == (f"arrays in {tmp_path / 'a.csv'}: when, x",)
@@ -564,7 +564,7 @@ def test_words_are_what_the_specification_says(tmp_path: Path, quote: str) -> No
     rows = [("0", "stop", "Yes", "1", "map"), ("1", "Light", "no", "2", "map")]
     lines = ["t,Sign,on,x,frame", *(",".join(f"{quote}{cell}{quote}" for cell in row) for row in rows)]
     path = csv(tmp_path / "a.csv", "\n".join(lines))
-    trace = load_trace(path, Reading({"sign": "Sign"}, words=WORDS))
+    trace = Trace.load(path, Reading({"sign": "Sign"}, words=WORDS))
     assert {name: values.tolist() for name, values in trace.data.items()} == {
         "sign": [[0, 1]],
         "on": [[1, 0]],
@@ -582,7 +582,7 @@ def test_words_are_what_the_specification_says(tmp_path: Path, quote: str) -> No
 )
 def test_words_that_a_signal_does_not_have(tmp_path: Path, text: str, message: str, said: str) -> None:
     with pytest.raises(TraceError) as caught:
-        load_trace(csv(tmp_path / "a.csv", text), Reading(words=WORDS))
+        Trace.load(csv(tmp_path / "a.csv", text), Reading(words=WORDS))
     (finding,) = caught.value.diagnostics
     assert finding.code == "E603"
     assert message in finding.message
@@ -591,14 +591,14 @@ def test_words_that_a_signal_does_not_have(tmp_path: Path, text: str, message: s
 
 def test_other_suffixes_are_listed(tmp_path: Path) -> None:
     with pytest.raises(TraceError, match=r"none of \.npz \.csv \.tsv \.txt \.jsonl \.ndjson \.parquet"):
-        load_trace(csv(tmp_path / "a.doc", "t,x\n0,1\n"))
-    save_trace(tmp_path / "a.npz", a_trace())
+        Trace.load(csv(tmp_path / "a.doc", "t,x\n0,1\n"))
+    a_trace().save(tmp_path / "a.npz")
     (tmp_path / "a.npz").rename(tmp_path / "a.bin")
-    assert load_trace(tmp_path / "a.bin").samples == a_trace().samples
-    assert load_trace(csv(tmp_path / "a.tsv", "t\tx\n0\t1\n1\t2\n")).samples == 2
+    assert Trace.load(tmp_path / "a.bin").samples == a_trace().samples
+    assert Trace.load(csv(tmp_path / "a.tsv", "t\tx\n0\t1\n1\t2\n")).samples == 2
     for path in ("a.doc", "a"):
         with pytest.raises(UsageError, match=r"written as \.npz, \.csv or \.mcap"):
-            save_trace(tmp_path / path, a_trace())
+            a_trace().save(tmp_path / path)
 
 
 def test_csv_that_is_not_text(tmp_path: Path) -> None:
@@ -628,20 +628,20 @@ def test_a_clock_of_words_without_samples_is_a_diagnostic(tmp_path: Path) -> Non
     empty = np.zeros(0)
     np.savez(tmp_path / "none.npz", x=empty, t=empty.astype("U4"))
     with pytest.raises(TraceError):
-        load_trace(tmp_path / "none.npz")
+        Trace.load(tmp_path / "none.npz")
 
 
 def test_a_csv_of_empty_cells_is_a_diagnostic(tmp_path: Path) -> None:
     (tmp_path / "gaps.csv").write_text("t,x\n,\n,\n,,")
     with pytest.raises(TraceError):
-        load_trace(tmp_path / "gaps.csv")
+        Trace.load(tmp_path / "gaps.csv")
 
 
 @pytest.mark.parametrize("reading", [Reading(), Reading(resample=1.0)])
 def test_times_that_are_too_far_apart(tmp_path: Path, reading: Reading) -> None:
     (tmp_path / "a.csv").write_text("t,x\n-1e308,1\n1e308,1\n")
     with pytest.raises(TraceError, match="too long to be measured"):
-        load_trace(tmp_path / "a.csv", reading)
+        Trace.load(tmp_path / "a.csv", reading)
 
 
 def test_a_frame_has_a_row_for_each_sample():

@@ -10,7 +10,7 @@ from PIL import Image
 
 from stlc.rundir import RunDir
 from stlc.signature import Column, Signature
-from stlc.trace import Trace, TraceMeta, save_trace
+from stlc.trace import Trace, TraceMeta
 from stlc.units import Unit
 
 FRAMES = 4
@@ -248,7 +248,7 @@ def simulation():
 @pytest.fixture
 def deployed(trained, recording):
     """The same run with a recorded deployment that was animated."""
-    save_trace(trained.path / "trace.npz", recording)
+    recording.save(trained.path / "trace.npz")
     trained.write_json("eval/simulate.json", simulation())
     Image.new("P", (8, 8)).save(trained.path / "traffic.gif")
     return trained

@@ -9,7 +9,6 @@ from itertools import product
 
 import pytest
 
-from stlc.trace import save_trace
 from stlc.view.report import write_report
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -52,7 +51,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="the
 @pytest.fixture
 def written(deployed, recording):
     """A report with an animation."""
-    save_trace(deployed.path / "trace.npz", recording)
+    recording.save(deployed.path / "trace.npz")
     write_report(deployed)
     return deployed.path
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from stlc.rundir import RunDir
-from stlc.trace import load_trace, save_trace
+from stlc.trace import Trace
 from stlc.view import player
 from stlc.view.contents import read_contents
 from stlc.view.report import render_report, write_report
@@ -45,9 +45,9 @@ def compared(deployed, recording):
     lines.insert(lines.index("test:") + 1, '  world: "dots.py:Dots"')
     (deployed.path / "system.yaml").write_text("\n".join(lines) + "\n")
     (deployed.path / "dots.py").write_text(WORLD)
-    save_trace(deployed.path / "trace.npz", recording)
+    recording.save(deployed.path / "trace.npz")
     first = {name: rows[:10] for name, rows in recording.data.items()}
-    save_trace(deployed.path / RunDir.UNGUARDED[0], replace(recording, data=first, extras={}))
+    replace(recording, data=first, extras={}).save(deployed.path / RunDir.UNGUARDED[0])
     scene = {"x": np.linspace(1, 9, 151)[:, None] + np.zeros(10)}
     decisions = np.concatenate((recording.extras["decision"][:10].T, np.zeros((1, 10))))
     np.savez(deployed.path / "scene.npz", **scene, decision=decisions.astype(np.int8))
@@ -114,12 +114,12 @@ def test_what_cannot_be_compared_is_shown_alone(compared, damage):
 
 
 def test_a_system_without_a_world_is_scrubbed_by_its_signals(deployed, recording):
-    save_trace(deployed.path / "trace.npz", recording)
+    recording.save(deployed.path / "trace.npz")
     (panel,) = run_panels(deployed)
     assert panel.frames == recording.samples
     animation = panel.vector_frames(range(0, 151, 50))
     assert len(animation.frames) == 4
     words = {command[3] for command in animation.commands if command[0] == "t"}
     assert "v\n[m/s]" in words or {"v", "[m/s]"} <= words
-    trace = load_trace(deployed.path / "trace.npz")
+    trace = Trace.load(deployed.path / "trace.npz")
     assert len(panel.names) == trace.traces

@@ -6,7 +6,6 @@ from helpers.walks import SPEC, judged, walk
 from PIL import Image
 
 from stlc.rundir import RunDir
-from stlc.trace import save_trace
 from stlc.view.animation import save_animation
 from stlc.view.contents import read_contents
 from stlc.view.recorded import map_section
@@ -85,7 +84,7 @@ def test_a_run_whose_specification_names_places_shows_the_map(tmp_path):
     run = RunDir.create(tmp_path, "walk")
     trace = walk()
     run.update({"spec": "walk", "status": "finished"})
-    save_trace(run.path / "trace.npz", trace)
+    trace.save(run.path / "trace.npz")
     animation = animation_of(run)
     assert animation is not None
     assert "regions" in animation.alt

@@ -14,7 +14,6 @@ import stlc.view
 from stlc.controller.evaluation.metrics import METRICS
 from stlc.diagnostics import MissingError, RunError
 from stlc.rundir import RunDir
-from stlc.trace import save_trace
 from stlc.view.contents import read_contents
 from stlc.view.deployment import deployment_section
 from stlc.view.report import render_report, repeat_section, sections_of, write_report
@@ -173,7 +172,7 @@ def test_what_is_damaged_or_missing_is_left_out(deployed):
 @pytest.mark.usefixtures("undrawn")
 def test_a_trace_of_another_specification_says_so(deployed, recording):
     meta = replace(recording.meta, spec_text="spec other\nsignal z [m]\nrequire r: always[0, T] z > 0\n")
-    save_trace(deployed.path / "trace.npz", replace(recording, meta=meta))
+    replace(recording, meta=meta).save(deployed.path / "trace.npz")
     os.utime(deployed.path / "traffic.gif")
     page = page_of(deployed)
     assert "The trace could not be judged" in page.text

@@ -125,7 +125,7 @@ def verify(run: Run | Path | str, options: VerifyOptions) -> Verified:
     from stlc.assurance.verification.plans import PolicySource
     from stlc.assurance.verification.verify import Verifier
     from stlc.controller.parallel.workers import LocalProcesses
-    from stlc.controller.run.run import folder_of
+    from stlc.controller.run.run import Run
     from stlc.controller.training.budget import clock_of
 
     torch.set_num_threads(1)  # for the few states of a box, threads cost more than they save
@@ -135,7 +135,7 @@ def verify(run: Run | Path | str, options: VerifyOptions) -> Verified:
     elif options.period is not None or options.system is not None or options.continuous:
         raise usage("--period, --system and --continuous are for a network: --controller FILE")
     else:
-        folder = folder_of(run, options.runs)
+        folder = Run.folder(run, options.runs)
         name, source = folder.shown, PolicySource(folder.path)
     with driving(options.python):
         subject = source.load()

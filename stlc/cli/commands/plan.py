@@ -93,9 +93,9 @@ def plan(
     from stlc.controller.search.planner import PlanBudget, PlanSearch, planner_named, prepared
     from stlc.controller.search.planner_policy import PlannerChoice
     from stlc.stopping import leaving
-    from stlc.trace import check_writable, save_trace
+    from stlc.trace import Trace
 
-    check_writable(output)
+    Trace.check_writable(output)
     require_separate([("--out", output)], (spec, system, from_))
     choice = PlannerChoice(method, option, budget)
     judged = None if evaluations is None else parse_count(evaluations, "--evaluations")
@@ -108,7 +108,7 @@ def plan(
 
     def save(found: PlanResult) -> None:
         if len(found.rho):
-            save_trace(output, trace_of(task, found, seed))
+            trace_of(task, found, seed).save(output)
 
     def interrupted(found: PlanResult) -> None:
         say(f"interrupted: {len(found.rho):,} of {len(states):,} initial states were planned for")

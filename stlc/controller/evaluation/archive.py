@@ -14,7 +14,7 @@ from stlc.controller.evaluation.executed import model_consistent
 from stlc.controller.search.plan_traces import meta_of, trace_along
 from stlc.files import File
 from stlc.rundir import RunDir
-from stlc.trace import Trace, save_trace
+from stlc.trace import Trace
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -83,7 +83,7 @@ def save_trace_of(
     trace = trace_of(run, recording, setting, rules)
     paths = [run.dir.place(RunDir.TRACE), *([also] if also is not None else [])]
     for path in paths:
-        save_trace(path, trace)
+        trace.save(path)
     return paths
 
 
@@ -108,7 +108,7 @@ def save_unguarded(
     first = slice(0, recording.agents)
     data = {name: rows[first] for name, rows in trace.data.items()}
     extras = {name: rows[first] for name, rows in trace.extras.items()}
-    save_trace(trace_path, replace(trace, data=data, extras=extras))
+    replace(trace, data=data, extras=extras).save(trace_path)
     save_scene(scene_path, recording.scene)
 
 

@@ -19,7 +19,7 @@ from stlc.compile.pipeline import compile_spec
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.evaluation.causes import Cause, Lost, losses
 from stlc.controller.evaluation.executed import MOST_TIMED
-from stlc.controller.run.run import INDEX, read_library, save_library
+from stlc.controller.run.run import save_library
 from stlc.diagnostics import Diagnostic, SystemFileError, UsageError
 from stlc.files import File
 from stlc.grammar import ast
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from stlc.rundir import RunDir
 
 JUDGE = "judge"
-_INDEX = f"{JUDGE}/{INDEX}"
+_INDEX = f"{JUDGE}/{RunDir.INDEX}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +211,7 @@ def rules_for(folder: RunDir, decl: SystemDecl) -> Rules | None:
         return Rules(spec, str(judge.path), _own(spec, overrides))
     name = entry["file"]
     spec = parse(folder.source(f"{JUDGE}/{name}"))
-    spec = replace(spec, library=read_library(folder, _library_of(name)))
+    spec = replace(spec, library=folder.library(_library_of(name)))
     return Rules(spec, entry.get("path") or name, _own(spec, overrides))
 
 

@@ -19,7 +19,6 @@ from stlc.dynamics.system import System
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
 from stlc.plugins import variable
-from stlc.provenance import sha256
 from stlc.registry import GUARDS, METHODS, PLANNERS, PackageRegistry
 from stlc.rundir import RunDir
 from stlc.tabular import html_table
@@ -32,8 +31,6 @@ if TYPE_CHECKING:
     from stlc.controller.policies.policy import PlanProposer, Policy
     from stlc.dynamics.declaration.decl import SystemDecl
 
-LIB = "lib"
-INDEX = "index.json"
 CONFIG = "config.resolved.yaml"
 
 
@@ -79,9 +76,46 @@ class Run:
             SpecError, SystemFileError: its specification or system is invalid.
         """
         folder = RunDir.open(where, root)
-        task = task_of_run(folder, overrides, scenario)
+        task = Run.task_in(folder, overrides, scenario)
         config = load_config(folder)
         return cls(folder, task, METHODS.get(config.method).load(task, folder, config, device))
+
+    @staticmethod
+    def folder(run: Run | Path | str, runs: Path = RunDir.RUNS) -> RunDir:
+        """Folder of a run, or of the one that is called so below `runs`; see `RunDir.open`."""
+        return run.dir if isinstance(run, Run) else RunDir.open(run, runs)
+
+    @staticmethod
+    def task_in(
+        folder: RunDir, overrides: Mapping[str, str] | None = None, scenario: str | None = None
+    ) -> Task:
+        """Compile the specification and the system in a run's folder.
+
+        Plans reach to the end of a deployment (`Task.of`) as they did in the run.
+
+        Args:
+            folder: folder of the run, whose own `--set` changes are applied first.
+            overrides: further changes, name -> text. A parameter that varied in training gets the given
+                value. It remains an entry of the state, because the policy observes it.
+            scenario: name of a scenario of the system file to apply.
+        """
+        trained = folder.record().get("overrides") or {}
+        spec = replace(parse(folder.source(RunDir.SPEC)), library=folder.library())
+        decl, changed = Run.declaration_in(folder, overrides, scenario), _changes(folder, overrides, scenario)
+        drawn = {item.name for item in spec.items if isinstance(item, ast.Param)} - trained.keys()
+        values = {name: text for name, text in changed.items() if name in drawn}
+        constants = {name: text for name, text in changed.items() if name not in drawn}
+        config = folder.read_json(CONFIG) if folder.has(CONFIG) else {}
+        whole = isinstance(config, dict) and ("planner" in config or config.get("whole") is True)
+        return Task.of(spec, System(decl), overrides=constants, values=values, whole=whole)
+
+    @staticmethod
+    def declaration_in(
+        folder: RunDir, overrides: Mapping[str, str] | None = None, scenario: str | None = None
+    ) -> SystemDecl:
+        """Read the system in a run's folder. No code is run; the arguments are those of `task_in`."""
+        decl = load_system_decl(folder.source(RunDir.SYSTEM), _changes(folder, overrides, scenario))
+        return decl if scenario is None else under(decl, scenario)
 
     def __repr__(self) -> str:
         name = f"{self.dir.path.parent.name}/{self.dir.name}"
@@ -127,43 +161,6 @@ class Run:
         return self.policy.plan_judged(x0)
 
 
-def folder_of(run: Run | Path | str, runs: Path = RunDir.RUNS) -> RunDir:
-    """Folder of a run, or of the one that is called so below `runs`; see `RunDir.open`."""
-    return run.dir if isinstance(run, Run) else RunDir.open(run, runs)
-
-
-def task_of_run(
-    folder: RunDir, overrides: Mapping[str, str] | None = None, scenario: str | None = None
-) -> Task:
-    """Compile the specification and the system in a run's folder.
-
-    Plans reach to the end of a deployment (`Task.of`) as they did in the run.
-
-    Args:
-        folder: folder of the run, whose own `--set` changes are applied first.
-        overrides: further changes, name -> text. A parameter that varied in training gets the given value. It
-            remains an entry of the state, because the policy observes it.
-        scenario: name of a scenario of the system file to apply.
-    """
-    trained = folder.record().get("overrides") or {}
-    spec = replace(parse(folder.source(RunDir.SPEC)), library=read_library(folder))
-    decl, changed = declaration_of_run(folder, overrides, scenario), _changes(folder, overrides, scenario)
-    drawn = {item.name for item in spec.items if isinstance(item, ast.Param)} - trained.keys()
-    values = {name: text for name, text in changed.items() if name in drawn}
-    constants = {name: text for name, text in changed.items() if name not in drawn}
-    config = folder.read_json(CONFIG) if folder.has(CONFIG) else {}
-    whole = isinstance(config, dict) and ("planner" in config or config.get("whole") is True)
-    return Task.of(spec, System(decl), overrides=constants, values=values, whole=whole)
-
-
-def declaration_of_run(
-    folder: RunDir, overrides: Mapping[str, str] | None = None, scenario: str | None = None
-) -> SystemDecl:
-    """Read the system in a run's folder. No code is run; the arguments are those of `task_of_run`."""
-    decl = load_system_decl(folder.source(RunDir.SYSTEM), _changes(folder, overrides, scenario))
-    return decl if scenario is None else under(decl, scenario)
-
-
 def _changes(folder: RunDir, overrides: Mapping[str, str] | None, scenario: str | None) -> dict[str, str]:
     trained = folder.record().get("overrides") or {}
     overlay: Mapping[str, str] = {}
@@ -183,23 +180,13 @@ def load_weights(folder: RunDir, module: Net, prefix: str) -> Net:
         RunError: R101, there is no checkpoint, it is damaged, or it does not fit the module; R102, it belongs
             to another task.
     """
-    saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=trained_on(folder))
+    saved = load_checkpoint(folder, **folder.hashes | {"system_hash": trained_on(folder)})
     try:
         module.load_state_dict(weights(saved, prefix))
     except RuntimeError as error:
         message = f"the checkpoint of `{folder.shown}` does not fit its network"
         raise RunError.of("R101", message, note=(str(error),)) from error
     return module
-
-
-def spec_hash(folder: RunDir) -> str:
-    """SHA-256 of the specification in a run's folder, with its imports and the run's `--set` changes."""
-    return _hash(folder, RunDir.SPEC, read_library(folder))
-
-
-def system_hash(folder: RunDir) -> str:
-    """SHA-256 of the system file in a run's folder, with the run's `--set` changes."""
-    return _hash(folder, RunDir.SYSTEM)
 
 
 def trained_on(folder: RunDir) -> str:
@@ -210,7 +197,7 @@ def trained_on(folder: RunDir) -> str:
     training is returned, so that the checkpoint is accepted. After any other edit the hash of the present
     file is returned, so that the checkpoint is refused.
     """
-    now, record = system_hash(folder), folder.record()
+    now, record = folder.hashes["system_hash"], folder.record()
     then, learnt = record.get("system_hash"), record.get("learnt")
     if now == then or not isinstance(then, str) or learnt is None:
         return now
@@ -218,30 +205,12 @@ def trained_on(folder: RunDir) -> str:
     return then if decl.learnt == learnt else now
 
 
-def _hash(folder: RunDir, name: str, library: Mapping[str, str] | None = None) -> str:
-    overrides = folder.record().get("overrides") or {}
-    imports = json.dumps(dict(sorted(library.items()))) if library else ""
-    return sha256(folder.source(name).text + json.dumps(overrides, sort_keys=True) + imports)
-
-
-def save_library(folder: RunDir, library: Mapping[str, str], below: str = LIB) -> None:
+def save_library(folder: RunDir, library: Mapping[str, str], below: str = RunDir.LIB) -> None:
     """Save a specification's imports (name -> text) in the subfolder `below` of a run's folder."""
     for key, text in library.items():
         folder.write(f"{below}/{file_of(key)}", text)
     if library:
-        folder.write_json(f"{below}/{INDEX}", {key: file_of(key) for key in library})
-
-
-def read_library(folder: RunDir, below: str = LIB) -> dict[str, str]:
-    """Read the texts saved by `save_library`, by name of the import.
-
-    Raises:
-        RunError: R101, a text is damaged; R110, a name leads out of the run.
-    """
-    if not folder.has(f"{below}/{INDEX}"):
-        return {}
-    index: dict[str, str] = folder.read_json(f"{below}/{INDEX}", dict[str, str])
-    return {key: folder.source(f"{below}/{name}").text for key, name in index.items()}
+        folder.write_json(f"{below}/{RunDir.INDEX}", {key: file_of(key) for key in library})
 
 
 def save_config(folder: RunDir, config: ResolvedConfig) -> None:

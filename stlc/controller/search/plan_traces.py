@@ -17,7 +17,7 @@ from stlc.compile.frontend.modules import library_of, spec_sha256
 from stlc.diagnostics import UsageError, usage
 from stlc.grammar import ast
 from stlc.registry import closest
-from stlc.trace import Reading, Trace, TraceMeta, load_trace
+from stlc.trace import Reading, Trace, TraceMeta
 from stlc.trace.enums import words_of
 from stlc.trace.recording import conversion
 from stlc.version import __version__
@@ -115,7 +115,7 @@ def _recorded(task: Task, text: str, count: int | None, seed: int) -> Tensor:
         help_ = ("random", "x=1, v=2 m/s", "a trace, such as trace.npz")
         raise UsageError.of("U102", f"there is no file `{text}` with initial states", help=help_)
     columns = task.system.signature.columns
-    trace = load_trace(text, Reading(words={column.name: words_of(column) for column in columns}))
+    trace = Trace.load(text, Reading(words={column.name: words_of(column) for column in columns}))
     rows = min(trace.traces, count or trace.traces)
     states = task.sample(rows, seed=seed, dtype=torch.float64)
     missing = [name for name in task.plain.names if name not in trace.data]

@@ -9,7 +9,7 @@ from stlc.compile.dump import dump
 from stlc.compile.frontend.modules import library_of
 from stlc.controller.evaluation.rules import keep_rules
 from stlc.controller.run.config import ResolvedConfig
-from stlc.controller.run.run import save_config, save_library, spec_hash, system_hash
+from stlc.controller.run.run import save_config, save_library
 from stlc.controller.search.planner import prepared
 from stlc.controller.search.planner_policy import PlannerChoice, planner_of
 from stlc.controller.training.config import ENGINE_VERSION, TrainConfig, resolve_config
@@ -94,7 +94,7 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
         folder.write(name, path.read_bytes())
     keep_rules(folder, task)
     folder.write("compiled.txt", dump(task.compiled))
-    hashes = {"spec_hash": spec_hash(folder), "system_hash": system_hash(folder), "learnt": decl.learnt}
+    hashes = {**folder.hashes, "learnt": decl.learnt}
     folder.update(hashes)
     return folder
 

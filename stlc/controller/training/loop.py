@@ -18,7 +18,7 @@ from stlc.controller.parallel.ddp import ALONE, Ranks, find_device
 from stlc.controller.problem.load import require_controls
 from stlc.controller.run.checkpoint import Checkpoint, load_checkpoint, never_saved, restoring
 from stlc.controller.run.config import ResolvedConfig
-from stlc.controller.run.run import Run, load_config, spec_hash, system_hash, task_of_run
+from stlc.controller.run.run import Run, load_config
 from stlc.controller.search.conflict import refuted
 from stlc.controller.training.budget import PROVISIONAL, Pace, StepSchedule, TimeBudget, clock_of
 from stlc.controller.training.config import TrainConfig, resolve_config
@@ -239,7 +239,7 @@ def resume(
         _require_search(config, failures)
         now = clock_of(config.clock)
         started = now()
-        task = task_of_run(folder)
+        task = Run.task_in(folder)
         method: Method = METHODS.get(config.method)
         watch, writer = watch or Watch(), RunWriter(folder, writes=ranks.first)
         if config.threads:
@@ -317,7 +317,7 @@ class _Past:
         if not record.keys() >= {"status", "seed", "spec_hash"}:
             raise RunError(folder.damaged("run.json", ValueError("it does not say what was trained")))
         if not never_saved(folder) or "schedule" not in record:
-            saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
+            saved = load_checkpoint(folder, **folder.hashes)
         facts: Mapping[str, Any] = record if saved is None else saved.facts
         spent = (row.get("seconds") for row in folder.rows())
         before = max((seconds for seconds in spent if isinstance(seconds, int | float)), default=0.0)

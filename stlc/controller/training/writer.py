@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from stlc.controller.evaluation.held_out import Score, save_states
 from stlc.controller.run.checkpoint import save_checkpoint
-from stlc.controller.run.run import save_config, spec_hash, system_hash
+from stlc.controller.run.run import save_config
 from stlc.rundir import RunDir, Status
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class RunWriter:
             MissingError: R201, the checkpoint cannot be written; the last good one stays.
         """
         if self.writes:
-            hashes = {"spec_hash": spec_hash(self.folder), "system_hash": system_hash(self.folder)}
+            hashes = self.folder.hashes
             save_checkpoint(self.folder, tensors, {**facts, **hashes}, step=step)
 
     def held_out(self, task: Task, score: Score) -> None:

@@ -19,7 +19,7 @@ from stlc.controller.run.run import Run
 from stlc.grammar.parser import parse
 from stlc.rundir import RunDir
 from stlc.source import Source
-from stlc.trace import load_trace
+from stlc.trace import Trace
 
 SYSTEM = """
 stlc: 1
@@ -73,7 +73,7 @@ def test_gusts_that_push_the_cart_out_are_found_and_replayed(capsys, tmp_path):
     assert "near: violated, robustness -" in text
     assert "far: no violation in 32 simulations" in text
     assert "this is no proof" in text
-    trace = load_trace(tmp_path / "near.npz")
+    trace = Trace.load(tmp_path / "near.npz")
     assert np.abs(trace.data["x"]).max() > 1.3
     assert not (tmp_path / "far.json").exists()
     assert main(["falsify", "latest", "--replay", str(tmp_path / "near.json")]) == 1

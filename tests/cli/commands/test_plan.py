@@ -11,7 +11,7 @@ import torch
 
 from stlc.cli.framework.app import main
 from stlc.controller.search.planner import PlanSearch
-from stlc.trace import load_trace
+from stlc.trace import Trace
 
 ROOT = Path(__file__).parents[3]
 SPEC, SYSTEM = str(ROOT / "specs/traffic.stl"), str(ROOT / "examples/car.yaml")
@@ -77,7 +77,7 @@ def test_plans_found_before_a_signal_are_kept_and_counted(
     captured = capsys.readouterr()
     assert "interrupted: 1 of 5 initial states were planned for" in captured.err
     found = json.loads(captured.out)["result"]
-    assert found["starts"] == load_trace(trace).traces == 1
+    assert found["starts"] == Trace.load(trace).traces == 1
     assert found["robustness"]["least"] > -100.0
     assert signal.getsignal(number) is before
 

@@ -10,7 +10,7 @@ from stlc.cli.framework.app import main
 from stlc.grammar.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
-from stlc.trace import load_trace, save_trace
+from stlc.trace import Trace
 from stlc.view.plotted import _as_declared
 from stlc.view.verdicts import margins_of
 
@@ -18,7 +18,7 @@ from stlc.view.verdicts import margins_of
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    save_trace("walk.npz", walk())
+    walk().save("walk.npz")
 
 
 def test_a_map_of_one_trace(tmp_path, capsys):
@@ -63,7 +63,7 @@ def test_a_suffix_without_a_picture_names_the_formats(tmp_path, capsys):
 def test_what_is_violated_is_never_an_empty_panel(tmp_path, capsys):
     (tmp_path / "tank.stl").write_text(TANK)
     (tmp_path / "tank.csv").write_text("t,level\n" + "".join(f"{k},{1.5 + 0.1 * k}\n" for k in range(6)))
-    trace = load_trace(tmp_path / "tank.csv")
+    trace = Trace.load(tmp_path / "tank.csv")
     monitor = Monitor(PLANNED, dt=1, horizon=2)
     verdict = monitor.check(trace)
     assert verdict["low"].status == ["violated"]
@@ -78,7 +78,7 @@ def test_what_is_violated_is_never_an_empty_panel(tmp_path, capsys):
 
 def test_a_file_without_units_is_labelled_with_those_of_the_specification(tmp_path):
     (tmp_path / "tank.csv").write_text("t,level\n0,1\n1,2\n2,3\n")
-    trace = load_trace(tmp_path / "tank.csv")
+    trace = Trace.load(tmp_path / "tank.csv")
     told = _as_declared(trace, parse(Source("tank.stl", TANK)))
     assert (trace.signature["level"].unit.text, told.signature["level"].unit.text) == ("", "m")
 

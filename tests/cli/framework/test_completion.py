@@ -10,7 +10,7 @@ import pytest
 from stlc.cli.framework.app import main
 from stlc.rundir import RunDir
 from stlc.signature import Column, Signature
-from stlc.trace import Trace, TraceMeta, save_trace
+from stlc.trace import Trace, TraceMeta
 
 SPEC = """signal x [m]
 # require old: x > 0
@@ -25,7 +25,7 @@ def _project(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("s.stl").write_text(SPEC)
     meta = TraceMeta(spec_text="signal x\nrequire kept: x > 0\n")
-    save_trace("t.npz", Trace(Signature((Column("x"),)), 0.1, {"x": np.ones((1, 2))}, meta=meta))
+    Trace(Signature((Column("x"),)), 0.1, {"x": np.ones((1, 2))}, meta=meta).save("t.npz")
     for words in ("quiet-heron", "brisk-otter"):
         RunDir.create(Path("runs"), "cart", words).update({"status": "finished"})
     RunDir.create(Path("elsewhere"), "boat", "old-crow").update({"status": "finished"})

@@ -31,7 +31,7 @@ from stlc.controller.search.feasibility import solvable
 from stlc.diagnostics import MissingError, RunError, SystemFileError
 from stlc.monitor.verdict import Monitor
 from stlc.rundir import RunDir
-from stlc.trace import load_trace
+from stlc.trace import Trace
 
 SETTING = Setting(seeds=(0, 1), agents=6, steps=40)
 
@@ -312,7 +312,7 @@ def test_a_trace_carries_its_decisions_and_where_it_is_from(
     run = Run(car_run, car_task, BestOfKPolicy(car_task, None))  # type: ignore[arg-type]
     paths = save_trace_of(run, recorded, SETTING, tmp_path / "also.npz")
     for path in paths:
-        trace = load_trace(path)
+        trace = Trace.load(path)
         assert trace.traces == 12
         assert trace.meta.spec_text == (car_run.path / "spec.stl").read_text()
         assert trace.meta.run == car_run.name

@@ -16,7 +16,7 @@ from stlc.controller.evaluation.causes import Lost
 from stlc.controller.evaluation.executed import Executed
 from stlc.controller.evaluation.rules import JudgedRuns, Rules, judge_runs, judge_runs_by_plans, rules_of
 from stlc.controller.problem.task import Task
-from stlc.controller.run.run import Run, task_of_run
+from stlc.controller.run.run import Run
 from stlc.controller.search.local_search import SearchResult
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
@@ -70,7 +70,7 @@ def task_of(home: Path, overrides: Mapping[str, str] | None = None) -> Task:
 
 
 def opened(folder: RunDir, overrides: Mapping[str, str] | None = None, scenario: str | None = None) -> Run:
-    return Run(folder, task_of_run(folder, overrides, scenario), None)  # type: ignore[arg-type]
+    return Run(folder, Run.task_in(folder, overrides, scenario), None)  # type: ignore[arg-type]
 
 
 def run_of(home: Path, overrides: Mapping[str, str] | None = None) -> RunDir:

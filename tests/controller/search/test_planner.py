@@ -17,7 +17,7 @@ from stlc.controller.search.planner_policy import PlannerPolicy
 from stlc.diagnostics import TraceError, UsageError
 from stlc.monitor.verdict import Monitor
 from stlc.registry import PLANNERS
-from stlc.trace import load_trace, save_trace
+from stlc.trace import Trace
 
 
 @pytest.fixture(params=[name for name in PLANNERS.own if name != "policy"])
@@ -80,8 +80,8 @@ def test_initial_guesses_are_checked_and_within_bounds(tmp_path: Path) -> None:
 def test_a_plan_is_a_trace_that_the_monitor_judges_alike(car_task: Task, tmp_path: Path) -> None:
     x0 = car_task.sample(5, seed=2, dtype=torch.float64)
     found = planned(car_task, "search", x0)
-    save_trace(tmp_path / "plan.npz", trace_of(car_task, found, 2))
-    trace = load_trace(tmp_path / "plan.npz")
+    trace_of(car_task, found, 2).save(tmp_path / "plan.npz")
+    trace = Trace.load(tmp_path / "plan.npz")
     verdict = Monitor(car_task.compiled.spec).check(trace)
     assert verdict.satisfied == bool(found.satisfied.all())
     assert np.allclose(trace.extras["plan_rho"], found.rho.numpy())
@@ -94,13 +94,13 @@ def test_starts_are_drawn_written_or_recorded(car_task: Task, tmp_path: Path) ->
     assert given[:, names.index("v")].tolist() == [10.0, 10.0]
     assert given[:, names.index("sign")].tolist() == [1.0, 1.0]
     found = planned(car_task, "search", given)
-    save_trace(tmp_path / "plan.npz", trace_of(car_task, found))
+    trace_of(car_task, found).save(tmp_path / "plan.npz")
     assert torch.equal(starts_of(car_task, str(tmp_path / "plan.npz"), None, 0), given)
     assert starts_of(car_task, "random", 3, 0).shape == (3, len(names))
-    holes = load_trace(tmp_path / "plan.npz")
+    holes = Trace.load(tmp_path / "plan.npz")
     speeds = holes.data["v"].copy()
     speeds[1, 0] = np.nan
-    save_trace(tmp_path / "holes.npz", replace(holes, data={**holes.data, "v": speeds}))
+    replace(holes, data={**holes.data, "v": speeds}).save(tmp_path / "holes.npz")
     with pytest.raises(UsageError, match=r"trace 1 of `.*holes\.npz` has no first value of `v`"):
         starts_of(car_task, str(tmp_path / "holes.npz"), None, 0)
 

@@ -20,7 +20,6 @@ from hypothesis import strategies as st
 
 from stlc.controller.problem.task import Task
 from stlc.controller.run.checkpoint import load_checkpoint
-from stlc.controller.run.run import spec_hash, system_hash
 from stlc.controller.training.budget import (
     PROVISIONAL,
     Pace,
@@ -244,7 +243,7 @@ def _folder(task: Task, root: Path, config: TrainConfig) -> RunDir:
 
 
 def _saved(folder: RunDir) -> dict[str, torch.Tensor]:
-    return load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder)).tensors
+    return load_checkpoint(folder, **folder.hashes).tensors
 
 
 def _same(left: RunDir, right: RunDir) -> bool:
@@ -300,10 +299,7 @@ def test_a_budget_that_was_interrupted_near_its_end_tells_its_steps(car_task: Ta
     folder = _folder(car_task, tmp_path / "b", BUDGET)
     assert train(car_task, BUDGET, folder, Watch(stop=lambda: next(left) >= last)).interrupted
     resume(folder)
-    assert (
-        folder.record()["steps"]
-        == load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder)).facts["step"]
-    )
+    assert folder.record()["steps"] == load_checkpoint(folder, **folder.hashes).facts["step"]
 
 
 @pytest.mark.apart

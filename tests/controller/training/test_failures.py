@@ -11,7 +11,7 @@ import torch
 
 from stlc.controller.problem.task import Task
 from stlc.controller.run.checkpoint import load_checkpoint
-from stlc.controller.run.run import Run, spec_hash, system_hash
+from stlc.controller.run.run import Run
 from stlc.controller.training import loop
 from stlc.controller.training.budget import StepSchedule
 from stlc.controller.training.config import TrainConfig, resolve_config
@@ -50,7 +50,7 @@ def _folder(task: Task, root: Path, config: TrainConfig) -> RunDir:
 
 
 def _saved(run: RunDir) -> dict[str, torch.Tensor]:
-    return load_checkpoint(run, spec_hash=spec_hash(run), system_hash=system_hash(run)).tensors
+    return load_checkpoint(run, **run.hashes).tensors
 
 
 def test_kept_states_replace_a_part_of_the_fresh_ones() -> None:

@@ -11,7 +11,7 @@ import torch
 from stlc.cli.framework.app import main
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import PlanVerdicts, Task
-from stlc.controller.run.run import task_of_run
+from stlc.controller.run.run import Run
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import STEEPEST, Trainer, _bounded_slopes, _finite_mean
 from stlc.controller.training.mission_plans import mission_plans
@@ -109,7 +109,7 @@ def test_runs_plan_as_far_as_their_method_does(
     (tmp_path / "way.stl").write_text(WAY)
     small = ["--steps", "2", "--held-out", "8", "--drives", "0", "--batch", "8", "--no-pictures"]
     assert main(["train", "way.stl", "--method", method, "--name", "r", *small]) == 0
-    assert task_of_run(RunDir.open("latest")).horizon == steps
+    assert Run.task_in(RunDir.open("latest")).horizon == steps
 
 
 @pytest.mark.apart

@@ -17,7 +17,6 @@ from torch import nn
 from stlc.controller.parallel.ddp import ALONE, Ranks, expected, joined
 from stlc.controller.problem.task import Task
 from stlc.controller.run.checkpoint import load_checkpoint
-from stlc.controller.run.run import spec_hash, system_hash
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.final_evaluation import TrainingOutcome
 from stlc.controller.training.launch import Launch, open_folder
@@ -34,7 +33,7 @@ pytestmark = [pytest.mark.apart, pytest.mark.filterwarnings("ignore:.*fork.*:Dep
 
 
 def _tensors(run: RunDir) -> dict[str, torch.Tensor]:
-    return load_checkpoint(run, spec_hash=spec_hash(run), system_hash=system_hash(run)).tensors
+    return load_checkpoint(run, **run.hashes).tensors
 
 
 @pytest.fixture
@@ -215,7 +214,7 @@ def test_torchrun_on_the_command_line(number: int, status: str, tmp_path: Path) 
 
 
 def _facts(run: RunDir) -> object:
-    return load_checkpoint(run, spec_hash=spec_hash(run), system_hash=system_hash(run)).facts["step"]
+    return load_checkpoint(run, **run.hashes).facts["step"]
 
 
 def test_a_rank_without_a_gpu_of_its_own_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,6 @@ import pytest
 import torch
 
 from stlc.controller.run.checkpoint import load_checkpoint
-from stlc.controller.run.run import spec_hash, system_hash
 from stlc.rundir import RunDir, every_run
 
 ROOT = Path(__file__).parents[3]
@@ -36,7 +35,7 @@ def _started(*words: str) -> subprocess.Popen[bytes]:
 
 
 def _tensors(run: RunDir) -> dict[str, torch.Tensor]:
-    return load_checkpoint(run, spec_hash=spec_hash(run), system_hash=system_hash(run)).tensors
+    return load_checkpoint(run, **run.hashes).tensors
 
 
 def _saved(root: Path, process: subprocess.Popen[bytes]) -> RunDir:

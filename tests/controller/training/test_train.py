@@ -14,7 +14,7 @@ import torch
 from stlc.controller.evaluation.held_out import score, wilson
 from stlc.controller.problem.task import Task
 from stlc.controller.run.checkpoint import load_checkpoint
-from stlc.controller.run.run import Run, spec_hash, system_hash
+from stlc.controller.run.run import Run
 from stlc.controller.search.local_search import SearchResult
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.launch import Launch, open_folder
@@ -35,7 +35,7 @@ def _folder(task: Task, root: Path, config: TrainConfig) -> RunDir:
 
 
 def _saved(run: RunDir) -> dict[str, torch.Tensor]:
-    hashes = {"spec_hash": spec_hash(run), "system_hash": system_hash(run)}
+    hashes = run.hashes
     return load_checkpoint(run, **hashes).tensors
 
 

@@ -14,7 +14,7 @@ from stlc.monitor.facts.rules import RULES
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
 from stlc.source import Source
-from stlc.trace import Reading, Trace, load_trace
+from stlc.trace import Reading, Trace
 from stlc.units import Unit
 
 N = 40
@@ -115,7 +115,7 @@ def write(path: Path, head: str, *columns: np.ndarray) -> Path:
 def of_file(path: Path, spec: str, **reading: object) -> dict[str, tuple[str, str]]:
     found = (
         Monitor(spec)
-        .check(load_trace(path, Reading(read={"gap": False}, words={"gap": {}}, **reading)))
+        .check(Trace.load(path, Reading(read={"gap": False}, words={"gap": {}}, **reading)))
         .facts
     )
     return {fact.code: (fact.severity, fact.text) for fact in found}
@@ -160,7 +160,7 @@ def test_units_in_names(name: str, unit: str, says: str | None) -> None:
 def test_a_unit_in_the_header_is_converted(tmp_path: Path) -> None:
     path = write(tmp_path / "l.csv", "t,gap_mm [mm]", T, 1000.0 * RAMP)
     found = Monitor(GAP).check(
-        load_trace(path, Reading(names={"gap": "gap_mm"}, read={"gap": False}, words={"gap": {}}))
+        Trace.load(path, Reading(names={"gap": "gap_mm"}, read={"gap": False}, words={"gap": {}}))
     )
     assert "W721" not in {fact.code for fact in found.facts}
 
@@ -174,7 +174,7 @@ def test_a_signal_that_was_seen_for_a_part_of_the_time(tmp_path: Path) -> None:
     monitor = Monitor("signal a\nsignal b\nrequire r: always (a < 3 and b < 3)")
     found = {
         fact.signal: fact.text
-        for fact in monitor.check(load_trace(tmp_path / "l.npz", reading)).facts
+        for fact in monitor.check(Trace.load(tmp_path / "l.npz", reading)).facts
         if fact.code == "W719"
     }
     assert found == {"a": "`a` is known from 0 s to 3.9 s only", "b": "`b` is known from 1 s to 4.9 s only"}

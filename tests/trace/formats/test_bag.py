@@ -14,7 +14,7 @@ from helpers import robot_logs
 
 from stlc.diagnostics import StlcError
 from stlc.files import File
-from stlc.trace import Reading, Trace, load_trace
+from stlc.trace import Reading, Trace
 from stlc.trace.formats.messages import DamageError
 from stlc.trace.formats.paths import Selection
 from stlc.trace.formats.ros import decoder
@@ -24,7 +24,7 @@ X = np.sin(np.arange(21) / 10)
 
 def message_of(path: Path) -> str:
     with pytest.raises(StlcError) as caught:
-        load_trace(path)
+        Trace.load(path)
     return str(caught.value)
 
 
@@ -42,7 +42,7 @@ def check_state(trace: Trace) -> None:
 @pytest.mark.parametrize("compression", ["none", "bz2"])
 def test_a_bag_of_ros_1(tmp_path: Path, compression: str) -> None:
     (tmp_path / "a.bag").write_bytes(robot_logs.bag(X.tolist(), compression=compression))
-    trace = load_trace(tmp_path / "a.bag")
+    trace = Trace.load(tmp_path / "a.bag")
     check_state(trace)
     assert trace.data["robot.state.more[1]"][0].tolist() == [8.0] * 21
 
@@ -52,14 +52,14 @@ def test_a_bag_of_ros_2(tmp_path: Path) -> None:
     folder.mkdir()
     (folder / "drive_0.db3").write_bytes(robot_logs.bag2(X.tolist()))
     (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: {}")
-    check_state(load_trace(folder / "drive_0.db3"))
-    check_state(load_trace(folder))
+    check_state(Trace.load(folder / "drive_0.db3"))
+    check_state(Trace.load(folder))
 
 
 def test_a_folder_is_one_bag_of_several_files(tmp_path: Path) -> None:
     for k in (2, 10):
         (tmp_path / f"drive_{k}.db3").write_bytes(robot_logs.bag2([float(k)] * 3))
-    trace = load_trace(tmp_path, Reading(resample=0.1))
+    trace = Trace.load(tmp_path, Reading(resample=0.1))
     assert trace.data["robot.state.position.y"][0].tolist() == [2.0] * 3
     assert trace.samples == 3
 
@@ -112,7 +112,7 @@ def filled(writer: Any, store: Any, *, two: bool) -> None:
 
 
 def check_filled(path: Path) -> None:
-    trace = load_trace(path, Reading(resample=0.1))
+    trace = Trace.load(path, Reading(resample=0.1))
     np.testing.assert_allclose(trace.data["odom.pose.pose.position.x"][0], X, atol=1e-12)
     assert trace.data["odom.pose.covariance[35]"][0].tolist() == [35.0] * 21
     assert trace.data["on"][0].tolist() == [0.0] * 8 + [1.0] * 13
@@ -158,7 +158,7 @@ def test_usual_messages_need_no_definition_in_the_bag(tmp_path: Path) -> None:
         rows = [(k, n, k * 10**8, b"\0\1\0\0" + struct.pack("<d", k)) for k in range(5) for n in (1, 2)]
         database.executemany("INSERT INTO messages VALUES(?, ?, ?, ?)", rows)
     database.close()
-    assert {n: x.tolist() for n, x in load_trace(path).data.items()} == {"x": [[0.0, 1.0, 2.0, 3.0, 4.0]]}
+    assert {n: x.tolist() for n, x in Trace.load(path).data.items()} == {"x": [[0.0, 1.0, 2.0, 3.0, 4.0]]}
 
 
 # ---------------------------------------------------------------------------- hostile bags

@@ -14,7 +14,7 @@ from stlc.controller.problem.task import Task
 from stlc.controller.search.planner import PlanBudget, plan, planner_named
 from stlc.diagnostics import UsageError
 from stlc.rundir import RunDir
-from stlc.trace import load_trace
+from stlc.trace import Trace
 
 pytestmark = pytest.mark.apart
 
@@ -94,7 +94,7 @@ def test_a_planner_of_a_file_drives_and_its_run_is_judged(
     assert run.record()["plugins"][name]["source"] == f"the file `{file}`"
     monkeypatch.setenv("STLC_PLANNERS", "")
     assert main(["check", str(run.path / "trace.npz"), "--fail-under", "0"]) == 0
-    assert len(next(iter(load_trace(run.path / "trace.npz").data.values()))) == 2
+    assert len(next(iter(Trace.load(run.path / "trace.npz").data.values()))) == 2
     capsys.readouterr()
     assert main(["simulate", "latest", *SMALL]) == 3
     assert f"STLC_PLANNERS=benchmarks/methods/planners/{name}.py" in capsys.readouterr().err

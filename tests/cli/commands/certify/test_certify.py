@@ -20,7 +20,7 @@ from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
 from stlc.rundir import RunDir
 from stlc.signature import Column, Signature
-from stlc.trace import Trace, save_trace
+from stlc.trace import Trace
 
 SPEC = """spec cart
 system "cart.yaml"
@@ -373,7 +373,7 @@ def test_simulate_bounds_the_share_behind_its_counts(capsys: pytest.CaptureFixtu
 def a_file(name: str, peak: float) -> str:
     signature = Signature((Column("a"),))
     data = {"a": np.array([[0.0, peak, 0.0]])}
-    save_trace(name, Trace(signature, 0.1, data))
+    Trace(signature, 0.1, data).save(name)
     return name
 
 

@@ -16,7 +16,7 @@ import pytest
 
 from stlc.cli.framework.app import main
 from stlc.signature import Column, Signature
-from stlc.trace import Trace, TraceMeta, save_trace
+from stlc.trace import Trace, TraceMeta
 
 ROOT = Path(__file__).parents[4]
 GOLDEN = ROOT / "tests" / "golden" / "check"
@@ -48,7 +48,7 @@ def bad_drive(samples: int = SAMPLES) -> Trace:
 
 
 def saved(trace: Trace, name: str = "trace.npz") -> str:
-    save_trace(name, trace)
+    trace.save(name)
     return name
 
 

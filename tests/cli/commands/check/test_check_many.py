@@ -14,7 +14,7 @@ import pytest
 
 from stlc.cli.framework.app import main
 from stlc.signature import Column, Signature
-from stlc.trace import Trace, load_trace, save_trace
+from stlc.trace import Trace
 from stlc.trace.chunks import size_of
 from stlc.units import Unit
 
@@ -48,7 +48,7 @@ def a_trace(peak: float = 1.0, samples: int = N, first: float = 0.5, unit: str =
 def files(*traces: Trace, suffix: str = ".npz") -> list[str]:
     names = [f"{i}{suffix}" for i in range(len(traces))]
     for name, trace in zip(names, traces, strict=True):
-        save_trace(name, trace)
+        trace.save(name)
     return names
 
 
@@ -97,7 +97,7 @@ def test_traces_out_of_scope(capsys: pytest.CaptureFixture[str]) -> None:
     assert check("s.stl", good, outside, "-q") == 0
     both = a_trace()
     data = {name: np.concatenate([both.data[name], a_trace(9, first=-200).data[name]]) for name in both.data}
-    save_trace("both.npz", Trace(both.signature, 0.1, data))
+    Trace(both.signature, 0.1, data).save("both.npz")
     assert check("s.stl", "both.npz") == 0
     assert (
         "1 of 1 traces satisfy every requirement; 100 % of 1 starts; 1 out of scope"
@@ -142,7 +142,7 @@ def test_robustness_signals_have_units(suffix: str) -> None:
     )
     Path("u.csv").write_text("t,temp [K],speed [m/s]\n0,293.15,10\n0.1,333.15,20\n", encoding="utf-8")
     assert check("u.stl", "u.csv", "--out", f"margins{suffix}", "-q") == 0
-    margins = load_trace(f"margins{suffix}")
+    margins = Trace.load(f"margins{suffix}")
     assert [(c.name, c.unit.text) for c in margins.signature.columns] == [
         ("hot", "K"),
         ("fast", "km/h"),
@@ -156,7 +156,7 @@ def test_robustness_signals_have_units(suffix: str) -> None:
 def test_robustness_signals() -> None:
     names = files(a_trace(), a_trace(peak=3))
     check("s.stl", names[1], "--out", "rob.npz", "-q")
-    rob = load_trace("rob.npz")
+    rob = Trace.load("rob.npz")
     assert list(rob.data) == ["low", "soon", "window"]
     assert (rob.data["low"][0, 0], rob.data["low"][0, -1]) == (-1.0, 1.5)
     assert np.isnan(rob.data["window"][0, -1])
@@ -261,7 +261,7 @@ def stream(monkeypatch: pytest.MonkeyPatch, text: str | bytes, *arguments: str) 
 
 
 def as_csv(trace: Trace) -> str:
-    save_trace("stream.csv", trace)
+    trace.save("stream.csv")
     return Path("stream.csv").read_text()
 
 

@@ -26,7 +26,7 @@ from stlc.jsontext import plain
 from stlc.monitor.check import Question
 from stlc.monitor.online.online import How
 from stlc.monitor.verdict import Monitor, first_violation
-from stlc.trace import Trace, load_trace
+from stlc.trace import Trace
 
 SPEC = """spec small
 signal a [m]
@@ -241,7 +241,7 @@ def test_a_machine_that_does_not_see_the_files_gives_the_same(tmp_path: Path) ->
         assert plain(there.verdict) == plain(here.verdict)
         assert (there.errors, there.exit_code) == (here.errors, here.exit_code)
         assert (far.outputs == {}) == bool(here.errors)
-    assert load_trace("out/high.npz").data["low"].min() == -2.0
+    assert Trace.load("out/high.npz").data["low"].min() == -2.0
 
 
 def _unseen(call: RemoteCall) -> RemoteCall:

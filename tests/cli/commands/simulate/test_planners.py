@@ -10,7 +10,7 @@ import pytest
 from stlc.cli.framework.app import main
 from stlc.registry import PLANNERS
 from stlc.rundir import RunDir
-from stlc.trace import load_trace
+from stlc.trace import Trace
 
 ROOT = Path(__file__).parents[4]
 SMALL = ["--seeds", "0", "--agents", "2", "--steps", "3", "--no-pictures"]
@@ -33,7 +33,7 @@ def test_every_planner_drives(method: str, capsys: pytest.CaptureFixture[str]) -
     assert result["steps"] == 3
     run = RunDir.newest()
     assert main(["check", str(run.path / "trace.npz"), "--fail-under", "0"]) == 0
-    trace = load_trace(run.path / "trace.npz")
+    trace = Trace.load(run.path / "trace.npz")
     assert len(next(iter(trace.data.values()))) == 2
 
 

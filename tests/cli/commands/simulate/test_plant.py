@@ -13,7 +13,7 @@ from helpers.documents import misfits
 from stlc.assurance import plant_judge as module
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
-from stlc.trace import load_trace
+from stlc.trace import Trace
 
 CODE = """
 import os
@@ -100,7 +100,7 @@ def test_points_are_drawn_by_seed_and_recorded(capsys):
     assert simulate("--seeds", "0..3", "--from", "level=0.4 m", "--record", "trace.npz", "--jobs", "2") == 0
     text = capsys.readouterr().out
     assert "4 of 4 simulations satisfy every requirement" in text
-    trace = load_trace("trace.npz")
+    trace = Trace.load("trace.npz")
     assert (trace.traces, trace.samples) == (4, 21)
     assert (trace.data["level"][:, 0] == 0.4).all()
     assert len(np.unique(trace.data["leak"][:, 0])) == 4
@@ -133,7 +133,7 @@ def test_recorded_traces_are_checked_and_plotted(home, capsys):
     checked = json.loads(capsys.readouterr().out)["result"]
     assert (checked["traces"], checked["verdict"]) == (len(found), "violated")
     assert checked["satisfied_traces"] == [run["verdict"] for run in found].count("satisfied")
-    trace = load_trace("trace.npz")
+    trace = Trace.load("trace.npz")
     assert trace.meta.spec_set == {"most": "1.2 m"}
     assert [column.unit.text for column in trace.signature.columns] == ["m", "m/s", "Hz"]
     for row, run in enumerate(found):

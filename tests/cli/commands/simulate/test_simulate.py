@@ -20,7 +20,7 @@ from stlc.controller.deployment.batched import Worlds
 from stlc.dynamics.scenario import DISTURBED
 from stlc.monitor.verdict import Monitor
 from stlc.rundir import RunDir
-from stlc.trace import load_trace
+from stlc.trace import Trace
 
 ROOT = Path(__file__).parents[4]
 SCENARIO = "scenario: {slippery: {expect: ood, doc: wet leaves, model_mismatch: {vmax: 9 m/s}}}\n"
@@ -71,7 +71,7 @@ def test_the_newest_run_is_simulated_with_and_without_guard(
     assert any("guard acted in" in line for line in lines)
     assert lines[-1].split(maxsplit=1) == ["next", "stlc check trace.npz"]
     for path in (Path("trace.npz"), there.path / "trace.npz"):
-        trace = load_trace(path)
+        trace = Trace.load(path)
         assert (trace.traces, trace.samples) == (8, 17)
         assert trace.meta.run == there.name
     document = there.read_json("eval/simulate.json")
@@ -91,7 +91,7 @@ def test_a_trace_is_judged_by_the_constants_it_was_driven_with(
         guard["drives"]["rules"]["give_way"]["obeyed"] / 20,
     )
     trace = str(there.path / "trace.npz")
-    meta = load_trace(Path(trace)).meta
+    meta = Trace.load(Path(trace)).meta
     assert meta.spec_set == meta.judge_set == {"x_inter": "-19 m"}  # the other is the system's
 
     def share(*options: str) -> float:
@@ -135,7 +135,7 @@ def test_without_rules_drives_are_judged_as_plans_are(
     command = ["simulate", there.name, *SMALL, "--steps", "30", "--set", "test.judge=null"]
     assert main(command) == 0
     assert "of 8 drives satisfied traffic at every instant\n" in capsys.readouterr().out
-    assert load_trace(there.path / "trace.npz").meta.judge_text == ""
+    assert Trace.load(there.path / "trace.npz").meta.judge_text == ""
     assert main([*command, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert misfits(document, load_schema("simulate/1")) == []
@@ -176,7 +176,7 @@ def test_the_same_seed_gives_the_same_trace(there: RunDir) -> None:
     found = []
     for name in ("a.npz", "b.npz"):
         assert main(["simulate", "--guard", "paper", *SMALL, "--record", name]) == 0
-        found.append(load_trace(there.path.parents[2] / name))
+        found.append(Trace.load(there.path.parents[2] / name))
     assert all((found[0].data[signal] == found[1].data[signal]).all() for signal in found[0].data)
 
 
@@ -312,7 +312,7 @@ def test_a_world_that_fails_on_the_way_leaves_a_trace(
     assert code == 3
     assert "S207" in error
     assert "the first 4 steps" in error
-    assert load_trace(tmp_path / "t.npz").samples == 5
+    assert Trace.load(tmp_path / "t.npz").samples == 5
 
 
 def test_margins_come_as_json_lines(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:
@@ -328,7 +328,7 @@ def test_margins_come_as_json_lines(there: RunDir, capsys: pytest.CaptureFixture
     assert [(line["step"], line["seed"], line["agent"]) for line in lines] == [
         (step, seed, agent) for step in range(17) for seed in (0, 1) for agent in range(4)
     ]
-    trace = load_trace(there.path / "trace.npz")
+    trace = Trace.load(there.path / "trace.npz")
     decided = [["policy", "backup", "safest"].index(line["decided"].split()[0]) for line in lines[:-8]]
     assert decided == trace.extras["decision"].T.flatten().tolist()
     assert [line["plan_rho"] for line in lines[:-8]] == trace.extras["plan_rho"].T.flatten().tolist()
@@ -372,7 +372,7 @@ def test_an_interruption_leaves_the_trace_and_the_margins(
     monkeypatch.setattr(Worlds, "progress", interrupted)
     assert main(["simulate", *SMALL, "--live", "--robustness", "m.jsonl", "--record", "t.npz"]) == 130
     assert "the first 3 steps are in" in capsys.readouterr().err
-    assert load_trace("t.npz").samples == 4
+    assert Trace.load("t.npz").samples == 4
     assert len(Path("m.jsonl").read_text().splitlines()) == 3 * 8
     assert main(["check", "t.npz"]) in (0, 1, 4)
 

@@ -10,9 +10,8 @@ import torch
 
 from stlc.cli.framework.app import main
 from stlc.controller.run.checkpoint import load_checkpoint, save_checkpoint
-from stlc.controller.run.run import spec_hash, system_hash
 from stlc.rundir import RunDir
-from stlc.trace import load_trace
+from stlc.trace import Trace
 
 SPEC = "signal p [m]\nrequire near: always[0, T] abs(p) <= 3 m\n"
 SYSTEM = """\
@@ -97,7 +96,7 @@ def deployed(run: RunDir, world: str, *options: str) -> int:
 
 def checked(run: RunDir, samples: int) -> None:
     """The trace of the run has so many samples, and `stlc check` reads it."""
-    assert load_trace(run.path / "trace.npz").samples == samples
+    assert Trace.load(run.path / "trace.npz").samples == samples
     assert main(["check", str(run.path / "trace.npz")]) in (0, 1)
 
 
@@ -167,7 +166,7 @@ def test_a_world_that_writes_into_what_it_gets_changes_nothing_else(run: RunDir)
         "        moved = ", "        x += 0 * x + 100\n        action *= 0\n        moved = "
     )
     assert deployed(run, world) == 0
-    trace = load_trace(run.path / "trace.npz")
+    trace = Trace.load(run.path / "trace.npz")
     assert abs(trace.data["p"][:, 0]).max() <= 1.0
     assert abs(trace.extras["action.u"]).max() > 0.0
 
@@ -189,7 +188,7 @@ def broken(run: RunDir) -> RunDir:
     """A run whose network gives no numbers."""
     shutil.copytree(run.path, run.path.parent / "0002-broken", dirs_exist_ok=True)
     found = RunDir(run.path.parent / "0002-broken")
-    saved = load_checkpoint(found, spec_hash=spec_hash(found), system_hash=system_hash(found))
+    saved = load_checkpoint(found, **found.hashes)
     tensors = {
         name: torch.full_like(each, torch.nan) if each.is_floating_point() else each
         for name, each in saved.tensors.items()
