@@ -16,7 +16,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from shutil import rmtree
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 from stlc import cache
 from stlc.cache import Cache
@@ -33,9 +33,6 @@ from stlc.toolchain import (
     trouble,
     version,
 )
-
-if TYPE_CHECKING:
-    pass
 
 FLAGS = ("-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC", "-std=c11")
 VECTOR_FLAGS = ("-DVECTOR_MATH", *(f"-fno-builtin-{name}" for name in ("sin", "cos", "exp", "log")))

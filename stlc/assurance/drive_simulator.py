@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +18,10 @@ from stlc.controller.deployment.tape import BELOW
 from stlc.controller.evaluation.archive import trace_of
 from stlc.controller.evaluation.rules import Rules, rules_of, verdict_on_runs
 from stlc.controller.guard.guard import Guard
+from stlc.controller.run.run import Run
 from stlc.controller.world import world_type
-
-if TYPE_CHECKING:
-    from stlc.controller.run.run import Run
-    from stlc.monitor.judgement import Verdict
-    from stlc.trace import Trace
+from stlc.monitor.judgement import Verdict
+from stlc.trace import Trace
 
 MOST_COORDINATES = 4000
 """Random numbers of a drive at most that are searched; later ones are drawn."""

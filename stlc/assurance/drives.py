@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -22,25 +22,21 @@ from stlc.assurance.model_simulator import in_scope
 from stlc.compile.frontend.modules import spec_sha256
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import Setting
-from stlc.controller.deployment.simulator import Recorder, simulate
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Watch, simulate
 from stlc.controller.evaluation.executed import executed_robustness
 from stlc.controller.evaluation.rules import Rules, rules_for, verdict_on_runs
 from stlc.controller.guard.guard import Guard
+from stlc.controller.problem.task import Task
 from stlc.controller.run.checkpoint import FOLDER, POINTER, CheckpointHead
 from stlc.controller.run.run import CONFIG, Run
 from stlc.controller.world import independent_agents, world_type
+from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.functions import function_files
 from stlc.jsontext import plain
 from stlc.monitor.judgement import chosen
 from stlc.provenance import sha256
 from stlc.registry import GUARDS
 from stlc.rundir import RunDir
-
-if TYPE_CHECKING:
-    from stlc.controller.deployment.simulator import DeploymentRecording, Watch
-    from stlc.controller.problem.task import Task
-    from stlc.controller.run.run import Run
-    from stlc.dynamics.declaration.decl import SystemDecl
 
 ROWS = 1000
 """Largest number of agents that are simulated at once."""

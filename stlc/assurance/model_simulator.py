@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
 from stlc.assurance.simulation import PARTS, Simulations
@@ -23,19 +23,15 @@ from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.kernel import Adjoint, ObjectiveSlopes
 from stlc.controller.problem.load import load_task
 from stlc.controller.problem.native import NativeGradient, NativeJudge
+from stlc.controller.problem.task import Task
 from stlc.controller.search.plan_traces import trace_of
 from stlc.controller.search.planner import PlanResult
 from stlc.diagnostics import usage
+from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.quantiles import InitialPoints
 from stlc.monitor.instants import rule_bounds
 from stlc.monitor.values import Record
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from stlc.controller.problem.task import Task
-    from stlc.dynamics.declaration.decl import SystemDecl
-    from stlc.trace import Trace
+from stlc.trace import Trace
 
 Columns = Mapping[str, NDArray[np.float64]]
 """Signals of simulations: name -> (time, batch)."""

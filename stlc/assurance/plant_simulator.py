@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +19,7 @@ from stlc.compile.ir.traverse import nodes
 from stlc.diagnostics import SystemFileError
 from stlc.monitor.verdict import Monitor
 from stlc.plants.plant import Plant, PlantFinding, PlantRun
-
-if TYPE_CHECKING:
-    from stlc.trace import Trace
+from stlc.trace import Trace
 
 
 @dataclass(frozen=True, slots=True)

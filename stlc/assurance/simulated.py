@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
+from typing import Any, ClassVar, Literal, TypeAlias
 
 from stlc.activity import PULSE
 from stlc.assurance.certificate import Assessment, Claim, assess
@@ -23,7 +23,8 @@ from stlc.controller.evaluation.deployment import (
 )
 from stlc.controller.evaluation.rules import JudgedRuns, Rules, rules_of
 from stlc.controller.guard.kind import named_guard
-from stlc.controller.guard.margins import parse_margins
+from stlc.controller.guard.margins import MarginRequest, parse_margins
+from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.load import load_task, require_controls
 from stlc.controller.problem.task import Task
 from stlc.controller.run.run import Run
@@ -38,10 +39,6 @@ from stlc.registry import GUARDS, PLANNERS
 from stlc.rundir import RunDir
 from stlc.trace import Trace
 from stlc.units import time_text
-
-if TYPE_CHECKING:
-    from stlc.controller.guard.margins import MarginRequest
-    from stlc.controller.policies.policy import Policy
 
 ALL, USUAL = "all", "disturbed"
 SCENARIOS = "eval/scenarios.json"

@@ -10,10 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, TypeAlias, final
-
-if TYPE_CHECKING:
-    pass
+from typing import Any, Literal, Protocol, Self, TypeAlias, final
 
 Array: TypeAlias = Any
 """A NumPy array or a torch tensor."""

@@ -8,7 +8,7 @@ subject to the `events` of the system file.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast, runtime_checkable
+from typing import Any, ClassVar, Protocol, cast, runtime_checkable
 
 import numpy as np
 import torch
@@ -17,14 +17,12 @@ from torch import Tensor
 
 from stlc.controller.sketch import DECIDED, Scene, deciders
 from stlc.diagnostics import RunError, SystemFileError
+from stlc.dynamics.declaration.decl import SystemDecl
+from stlc.dynamics.declaration.deployment import WorldRef
+from stlc.dynamics.system import System
 from stlc.dynamics.uncertainty.disturbance import Events
 from stlc.foreign import module_at
 from stlc.registry import closest
-
-if TYPE_CHECKING:
-    from stlc.dynamics.declaration.decl import SystemDecl
-    from stlc.dynamics.declaration.deployment import WorldRef
-    from stlc.dynamics.system import System
 
 
 class World(Protocol):

@@ -13,22 +13,26 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from string import Template
-from typing import TYPE_CHECKING, assert_never
+from typing import assert_never
 
 import torch
+from torch import Tensor
 
+from stlc.compile.augment.timers import Timer
 from stlc.compile.backends.c.emit import CHECK, HEAD, Motion, forward_blocks, passes, state_index
 from stlc.compile.backends.c.numbers import NumberWriter, literal
 from stlc.compile.backends.c.parts import declared, in_parts
 from stlc.compile.backends.c.plan import Plan, plan_of
 from stlc.compile.backends.numbers import Leaf
 from stlc.compile.ir import nodes as ir
+from stlc.compile.pipeline import CompiledRequirement
 from stlc.controller.guard.candidates import grid_of
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
 from stlc.controller.policies.policy import ClosedLoopActor, PlanProposer
 from stlc.controller.problem.native import motion_of
 from stlc.controller.problem.task import Task
 from stlc.dynamics.declaration.learning import START
+from stlc.dynamics.declaration.schema.names import ControlDecl
 from stlc.dynamics.model.controls import SQUASHES, raw_width
 from stlc.dynamics.model.cost import REDUCED, CostTerm
 from stlc.dynamics.model.step import commands
@@ -36,15 +40,7 @@ from stlc.escape import c_comment, c_string
 from stlc.export.description import control_images, observation, state_images
 from stlc.runtime.decision import TIE
 from stlc.runtime.prefixes import generators
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from stlc.compile.augment.timers import Timer
-    from stlc.compile.pipeline import CompiledRequirement
-    from stlc.dynamics.declaration.schema.names import ControlDecl
-    from stlc.signature import Column
-
+from stlc.signature import Column
 
 # ------------------------------------------------------------------------------------ names of its own
 

@@ -9,17 +9,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
+
+from torch import Tensor
 
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.onnx.graph import BATCH, OnnxGraph, Value, joined
 from stlc.compile.backends.onnx.ops import ONNX, ONNX_OPS, Columns, build_graph, require_numbers
 from stlc.compile.ir import nodes as ir
+from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.kinds.exact import Exact
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
 from stlc.controller.policies.policy import ClosedLoopActor, PlanProposer
 from stlc.controller.problem.task import Task
+from stlc.dynamics.declaration.schema.names import ControlDecl
 from stlc.dynamics.model.controls import raw_width, shares
 from stlc.dynamics.model.rollout import Stepper
 from stlc.dynamics.model.step import ModelStep
@@ -29,13 +33,6 @@ from stlc.export.description import (
     state_images,
 )
 from stlc.runtime.decision import rank
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from stlc.compile.pipeline import CompiledRequirement
-    from stlc.dynamics.declaration.schema.names import ControlDecl
-
 
 # --------------------------------------------------------------------------------------------- rollout
 

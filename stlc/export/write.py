@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias, get_args
+from typing import ClassVar, Literal, TypeAlias, get_args
 
 import torch
 
 from stlc.compile.backends.numbers import Untranslatable
+from stlc.controller.run.run import Run
 from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.export import c_header
 from stlc.export.c_header import public, weights
@@ -37,9 +38,6 @@ from stlc.files import File, place
 from stlc.jsontext import dumps
 from stlc.runtime.facts import read_facts
 from stlc.runtime.graphs import Graphs
-
-if TYPE_CHECKING:
-    from stlc.controller.run.run import Run
 
 Target: TypeAlias = Literal["torch", "c", "onnx"]
 TARGETS: tuple[Target, ...] = get_args(Target)

@@ -5,19 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
+from torch import Tensor
 
 from stlc.compile.ir.ranges import bounds
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import usage
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 Floats: TypeAlias = NDArray[np.float32]
 

@@ -7,16 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from stlc.diagnostics import Diagnostic, SpecError, SystemFileError, UsageError, usage
 from stlc.files import File
 from stlc.lint.lint import Selection, Surroundings
 from stlc.lint.lint import fix as repair
 from stlc.lint.lint import lint as lint_text
-
-if TYPE_CHECKING:
-    from stlc.source import Source
+from stlc.source import Source
 
 
 @dataclass(frozen=True, slots=True)

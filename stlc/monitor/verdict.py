@@ -521,7 +521,7 @@ def first_violation(judgement: RequirementVerdict) -> int:
         fails = _judge(judgement.rule, subject, starts, "open", judgement.tolerance, shorter).fails
         return bool(judgement.counted(fails).any())
 
-    return bisect_left(range(part.stop), True, lo=start + 1, key=TOLERANCE.violated) - 1
+    return bisect_left(range(part.stop), True, lo=start + 1, key=violated) - 1
 
 
 def timed(verdict: Verdict) -> Verdict:

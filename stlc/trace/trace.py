@@ -110,7 +110,7 @@ class Trace:
         """Read a trace; the suffix of the file determines the format.
 
         Suffixes are `.csv`, `.tsv`, `.jsonl`, `.parquet`, `.mat`, `.mcap`, `.bag`, `.db3`, `.ulg` and `.mf4`;
-        a folder is a ROS 2 bag, and any other file is read as `.npz`. Values may be NaN (unknown) or infinite.
+        a folder is a ROS 2 bag, and any other file is an `.npz`. Values may be NaN (unknown) or infinite.
 
         Raises:
             UsageError: U102, there is no such file.

@@ -10,20 +10,18 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import Protocol, Self
 
 import numpy as np
 import torch
 
 from stlc.assurance.verification.around import narrowed
+from stlc.assurance.verification.boxes import Box, Mode
+from stlc.assurance.verification.forms import Bools, Floats
 from stlc.assurance.verification.judged import PROVED
+from stlc.assurance.verification.subject import Indices, VerificationSubject
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.parallel.workers import CallWorkers, LostCall, results
-
-if TYPE_CHECKING:
-    from stlc.assurance.verification.boxes import Box, Mode
-    from stlc.assurance.verification.forms import Bools, Floats
-    from stlc.assurance.verification.subject import Indices, VerificationSubject
 
 POINTS = 8
 """States that are sampled in each box: its centre and others at random."""

@@ -9,7 +9,7 @@ substeps, or the solution of its differential equations, with a bound on the err
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, final
+from typing import Any, final
 
 import numpy as np
 import torch
@@ -25,10 +25,8 @@ from stlc.assurance.verification.network import (
     reduced,
 )
 from stlc.assurance.verification.subject import History, Indices, VerificationSubject
+from stlc.controller.problem.task import Task
 from stlc.diagnostics import usage
-
-if TYPE_CHECKING:
-    from stlc.controller.problem.task import Task
 
 _KEPT = 40
 """Symbols besides those of the coordinates that states keep over a control period."""

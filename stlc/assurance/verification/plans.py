@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,12 +16,10 @@ from stlc.assurance.verification.subject import History, Indices, VerificationSu
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import children
 from stlc.controller.policies.policy import BestOfKPolicy, Policy
+from stlc.controller.problem.task import Task
 from stlc.diagnostics import usage
+from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.model.step import build_step
-
-if TYPE_CHECKING:
-    from stlc.controller.problem.task import Task
-    from stlc.dynamics.declaration.decl import SystemDecl
 
 _GROUP = 256
 """Boxes whose network is bounded at once."""

@@ -5,16 +5,13 @@ from __future__ import annotations
 import stat
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from stlc.cli.framework.completion import run_names
 from stlc.diagnostics import usage
 from stlc.files import File
-
-if TYPE_CHECKING:
-    pass
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on the standard output.")]
 RunArgument = Annotated[

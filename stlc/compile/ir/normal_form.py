@@ -9,15 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, assert_never
+from typing import Any, Literal, TypeAlias, assert_never
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.nodes import DUAL
 from stlc.compile.ir.traverse import map_children
-
-if TYPE_CHECKING:
-    from stlc.source import Span
+from stlc.source import Span
 
 Sign: TypeAlias = Literal[1, -1]
 

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,15 +19,12 @@ from torch import Tensor
 from stlc.controller.deployment.tape import Tape
 from stlc.controller.deployment.world_errors import blamed, require_numbers, scene_of, states_of, wrong
 from stlc.controller.guard.candidates import Limits
+from stlc.controller.problem.task import Task
 from stlc.controller.search.feasibility import solvable, viable
 from stlc.controller.world import Charting, Choosing, Redrawing, WorldType
 from stlc.diagnostics import RunError, SystemFileError
+from stlc.dynamics.declaration.deployment import TestDecl
 from stlc.dynamics.uncertainty.disturbance import Disturbance
-
-if TYPE_CHECKING:
-    from stlc.controller.problem.task import Task
-    from stlc.dynamics.declaration.deployment import TestDecl
-
 
 REDRAWN = 50
 """Maximum number of draws of one agent's initial state."""

@@ -9,18 +9,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from traceback import extract_tb
 from types import CodeType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
 from stlc.files import File
 from stlc.source import Source, Span
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
@@ -39,13 +39,11 @@ from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.kind import compared_guards
 from stlc.controller.run.config import DRIVES
+from stlc.controller.run.run import Run
 from stlc.controller.world import world_type
 from stlc.diagnostics import StlcError
 from stlc.jsontext import Num
 from stlc.registry import GUARDS
-
-if TYPE_CHECKING:
-    from stlc.controller.run.run import Run
 
 SEED = 1 << 40
 """Seed of the first closed-loop runs; those of `simulate` begin at 0."""

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -21,14 +20,12 @@ from stlc.controller.evaluation.rules import Rules, RunVerdicts, judge_runs, jud
 from stlc.controller.evaluation.stats import MeanInterval
 from stlc.controller.guard.candidates import SOURCES
 from stlc.controller.guard.guard import Guard
+from stlc.controller.policies.policy import Policy
+from stlc.controller.problem.task import Task
 from stlc.controller.search.feasibility import solvable
 from stlc.controller.search.planner_policy import PlannerPolicy, SearchUse
 from stlc.controller.world import world_type
 from stlc.jsontext import Num
-
-if TYPE_CHECKING:
-    from stlc.controller.policies.policy import Policy
-    from stlc.controller.problem.task import Task
 
 LATENCY_SAMPLES = 200
 LATENCY_SECONDS = 5.0

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Literal, Self
+from typing import Literal, Self
 
 import torch
 from torch import Tensor, nn
@@ -21,14 +22,9 @@ from torch import Tensor, nn
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.environments import observe
 from stlc.controller.problem.task import PlanVerdicts, Task
+from stlc.dynamics.declaration.schema.names import ControlDecl
 from stlc.dynamics.model.controls import raw_width, squash, unsquash
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from stlc.dynamics.declaration.schema.names import ControlDecl
-    from stlc.dynamics.model.mirror import Mirror
-
+from stlc.dynamics.model.mirror import Mirror
 
 VARIATIONS = (0.01, 0.05)
 """Sizes of the changes in `variations`, as shares of half the range of a control."""

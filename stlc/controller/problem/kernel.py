@@ -11,15 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from threading import Lock
 from time import perf_counter
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stlc.dynamics.system import check_plans
 from stlc.native import Stop, never
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 GRAIN = 16
 """Rows that a kernel evaluates together (SIMD lanes)."""

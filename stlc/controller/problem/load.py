@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import usage
@@ -11,9 +11,6 @@ from stlc.dynamics.scenario import scenario_constants
 from stlc.dynamics.system import System
 from stlc.files import File
 from stlc.grammar.parser import parse
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
 
 HINT = "--system FILE"
 """Advice that most commands print if no system is named."""

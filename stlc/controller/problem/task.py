@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -12,6 +13,7 @@ from torch import Tensor
 from stlc.compile.backends.array.graph import RobustnessGraph, evaluate
 from stlc.compile.backends.c.adjoint import emit_adjoint
 from stlc.compile.backends.c.emit import emit
+from stlc.compile.backends.schedule import End
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.frontend.parameters import fixed
 from stlc.compile.ir import nodes as ir
@@ -23,17 +25,11 @@ from stlc.compile.semantics.switch import Hard, Switch
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.native import NativeGradient, NativeJudge, motion_of, reason
 from stlc.controller.problem.pending_goals import PendingGoals
-from stlc.dynamics.system import check_plans
+from stlc.dynamics.model.cost import PlanCost
+from stlc.dynamics.system import System, check_plans
+from stlc.grammar import ast
 from stlc.runtime.decision import rank
 from stlc.tabular import html_table
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from stlc.compile.backends.schedule import End
-    from stlc.dynamics.model.cost import PlanCost
-    from stlc.dynamics.system import System
-    from stlc.grammar import ast
 
 HARD = Hard()
 ROUNDS = 5

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError
@@ -22,11 +24,6 @@ from torch import Tensor
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.provenance import sha256
 from stlc.rundir import RunDir
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-    from pathlib import Path
-
 
 FOLDER = "ckpt"
 POINTER = "last.json"

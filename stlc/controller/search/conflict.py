@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,20 +17,18 @@ import torch
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.functions import Bounds
 from stlc.compile.ir.ranges import bounds
 from stlc.compile.ir.traverse import map_children, numbers, subexpressions
+from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
 from stlc.controller.search.feasibility import TARGET, solve
+from stlc.controller.search.local_search import SearchResult
 from stlc.controller.search.missed import better_planner, missed
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.diagnostics import Diagnostic, Label
 from stlc.native import Stop, never
-
-if TYPE_CHECKING:
-    from stlc.compile.ir.functions import Bounds
-    from stlc.compile.pipeline import CompiledRequirement
-    from stlc.controller.search.local_search import SearchResult
 
 STARTS = 64
 PROOF = (

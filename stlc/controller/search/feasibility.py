@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
 from stlc.controller.search.local_search import THOROUGH, Searcher, SearchResult
 from stlc.controller.search.starts import extremes
 from stlc.native import Stop, never
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
 
 PASSES = 4
 TRIES = 20_000

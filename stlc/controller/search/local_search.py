@@ -10,11 +10,11 @@ native kernel (compiled code) if there is one, otherwise in torch.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from threading import Event
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -25,10 +25,6 @@ from stlc.controller.problem.native import Effort
 from stlc.controller.problem.rows import Rows
 from stlc.controller.problem.task import Task
 from stlc.native import Stop, cores, never
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 
 CYCLE = 1000
 """Evaluations after which the search for plans of a mission changes the comparison of violating plans.

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+
+from torch import Tensor
 
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.diagnostics import StlcError
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
 
 STRUCTURED = ("schedule", "milp")
 """Planners that use the structure of a specification, for which a local search finds no plan."""

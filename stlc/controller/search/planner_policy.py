@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.policies.policy import Policy
+from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.controller.search.planner import PlanBudget, Planner, PlanSearch, Solver, planner_named, prepared
 from stlc.diagnostics import usage
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from stlc.controller.problem.task import PlanVerdicts, Task
 
 SHORT = 64
 """Number of plans judged in the search for a plan that continues a prefix."""

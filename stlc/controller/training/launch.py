@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from stlc.compile.dump import dump
 from stlc.compile.frontend.modules import library_of
 from stlc.controller.evaluation.rules import keep_rules
+from stlc.controller.problem.task import Task
 from stlc.controller.run.config import ResolvedConfig
 from stlc.controller.run.run import save_config, save_library
 from stlc.controller.search.planner import prepared
@@ -18,12 +20,6 @@ from stlc.provenance import git_state, hardware, sha256, versions
 from stlc.registry import METHODS, PLANNERS
 from stlc.rundir import RunDir, now, require_name
 from stlc.version import __version__
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from stlc.controller.problem.task import Task
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -24,6 +24,7 @@ from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import Task
 from stlc.controller.run.checkpoint import below
+from stlc.controller.run.config import ResolvedConfig
 from stlc.controller.run.run import load_weights
 from stlc.controller.search.feasibility import safety_task
 from stlc.controller.search.local_search import TAILS, THOROUGH, Search, Searcher, SearchResult, remainders
@@ -35,15 +36,10 @@ from stlc.controller.training.method import Learner, Method, Validation
 from stlc.controller.training.mission_plans import mission_plans
 from stlc.controller.training.objective import Objective, loss
 from stlc.controller.training.samplers import Draws, FixedSet, Missions, ReplayBuffer, Supply
+from stlc.diagnostics import StlcError
 from stlc.native import Stop, never
 from stlc.registry import METHODS
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from stlc.controller.run.config import ResolvedConfig
-    from stlc.diagnostics import StlcError
-    from stlc.rundir import RunDir
+from stlc.rundir import RunDir
 
 MARGIN_STATES = 128
 """Number of states from which the search looks for the largest robustness, to choose the margin."""

@@ -8,17 +8,13 @@ network begins at those.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
+from stlc.controller.problem.task import Task
 from stlc.controller.search.local_search import THOROUGH, Searcher, SearchResult
 from stlc.controller.search.planner import PlanBudget, plan
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from stlc.controller.problem.task import Task
 
 EFFORTS = {16: 20_000, 4: 60_000}
 """Number of missions for which plans are searched -> plans judged for each; the next if none is found."""

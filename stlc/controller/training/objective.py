@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -12,10 +12,6 @@ from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.switch import StraightThrough, Switch, Tanh
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
 
 VIOLATION = 2.0
 """Weight of the hinge at robustness 0 in the objective of `guided`, relative to the hinge at the margin."""

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from pathlib import Path
+from typing import Any, Protocol, TypeAlias
 
 from stlc.escape import markdown, tag
 from stlc.extras import needed
 from stlc.files import place
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 FOLDER = "tensorboard"
 _PLAIN = ("accuracy", "feasible", "loss", "lr", "s_per_step")

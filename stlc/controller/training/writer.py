@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from torch import Tensor
 
 from stlc.controller.evaluation.held_out import Score, save_states
+from stlc.controller.problem.task import Task
 from stlc.controller.run.checkpoint import save_checkpoint
+from stlc.controller.run.config import ResolvedConfig
 from stlc.controller.run.run import save_config
 from stlc.rundir import RunDir, Status
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from torch import Tensor
-
-    from stlc.controller.problem.task import Task
-    from stlc.controller.run.config import ResolvedConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,14 +14,12 @@ from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.switch import Hard
 from stlc.dynamics.declaration.deployment import ErrorsDecl, EventDecl
+from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.declaration.perturbable import perturbable
 from stlc.dynamics.model.samplers import Drawing, Rows, seeded
+from stlc.dynamics.system import System
 from stlc.dynamics.uncertainty.perturbed import PerturbedSystem
 from stlc.units import Unit
-
-if TYPE_CHECKING:
-    from stlc.dynamics.declaration.motion import Assign
-    from stlc.dynamics.system import System
 
 SECOND = Unit.parse("s")
 _GAINS, _PUSHES, _BLURS, _NUMBERS = range(4)

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from torch import Tensor
 
 from stlc.diagnostics import usage
 from stlc.dynamics.declaration.perturbable import Perturbable
+from stlc.dynamics.model.rollout import Columns
 from stlc.dynamics.model.samplers import Drawing, completed
 from stlc.dynamics.system import System
-
-if TYPE_CHECKING:
-    from stlc.dynamics.model.rollout import Columns
 
 
 class PerturbedSystem(System):

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +23,7 @@ from stlc.monitor.judgement import RequirementVerdict, Verdict
 from stlc.monitor.prepared import Prepared
 from stlc.signature import Column
 from stlc.source import Span
-
-if TYPE_CHECKING:
-    from stlc.trace import Trace
+from stlc.trace import Trace
 
 Floats = NDArray[np.float64]
 

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir.support import columns_in
+from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.tolerance import TOLERANCE, StatusInScope
 from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.recompute import GrowingBounds
 from stlc.monitor.online.tally import Asked
-
-if TYPE_CHECKING:
-    from stlc.compile.pipeline import CompiledRequirement
 
 Counts: TypeAlias = NDArray[np.int64]
 

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,9 +41,7 @@ from stlc.trace.formats.layout import (
 from stlc.trace.formats.registry import MAX_LETTERS, unreadable
 from stlc.trace.formats.table import GROUPS, MAX_LINE, endless, place, size, text_lines, unpacked, utf8
 from stlc.trace.recording import ALL, ClockGroup, Recording, Wanted
-
-if TYPE_CHECKING:
-    from stlc.trace.trace import Trace
+from stlc.trace.trace import Trace
 
 __all__ = ["chunks", "delimiter_of", "filled", "head_cells", "read", "size", "split_head", "write"]
 

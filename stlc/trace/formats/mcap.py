@@ -16,7 +16,7 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -30,9 +30,7 @@ from stlc.trace.formats.registry import damage, unreadable
 from stlc.trace.formats.ros import Form, decoder
 from stlc.trace.meta import meta_array, read_meta
 from stlc.trace.recording import ALL, ClockGroup, Recording, Wanted
-
-if TYPE_CHECKING:
-    from stlc.trace.trace import Trace
+from stlc.trace.trace import Trace
 
 OURS = "stlc"
 """The metadata record that describes the signals."""

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO
 
 import numpy as np
 import numpy.lib.format as npy
@@ -26,9 +26,7 @@ from stlc.trace.formats.arrays import Array, Arrays, no_letters
 from stlc.trace.formats.registry import damage, opened, require_room, unreadable
 from stlc.trace.meta import TraceMeta, meta_array, read_meta
 from stlc.trace.recording import ALL, EXTRA, Recording, Wanted
-
-if TYPE_CHECKING:
-    from stlc.trace.trace import Trace
+from stlc.trace.trace import Trace
 
 MAX_NAME = 60_000
 """Greatest length in bytes of the name of an array in an archive."""

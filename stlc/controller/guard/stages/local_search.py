@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from stlc.controller.guard.candidates import REPAIRED, Candidates, Deadline
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup
+from stlc.controller.problem.task import Task
 from stlc.controller.search.feasibility import safety_task
 from stlc.controller.search.local_search import Searcher
-
-if TYPE_CHECKING:
-    from stlc.controller.problem.task import Task
 
 
 class LocalSearch(GuardStage):

@@ -5,8 +5,8 @@ Of all plans, the one is chosen that stays safe for the longest time.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -17,9 +17,6 @@ from stlc.controller.guard.safe_prefix import prefix_robustness
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup, Tried
 from stlc.controller.guard.stages.prefix_shooting import PrefixShooting
 from stlc.runtime.decision import longest
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 class LongestSafePrefix(GuardStage):

@@ -12,8 +12,8 @@ action. This is not in the paper (decision record 37 in `docs/decisions`).
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -22,9 +22,6 @@ from stlc.compile.backends.torch.ops import TORCH
 from stlc.controller.guard.candidates import BACKUP, Candidates, Deadline, completed, first
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup, Tried
 from stlc.runtime.decision import prefix_shooting
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
 
 HANDED_ON = 65_536
 """Maximum number of trajectories stored for the next stage, which recomputes the others."""

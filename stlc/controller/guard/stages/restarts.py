@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from torch import Tensor
 
 from stlc.controller.guard.candidates import REPAIRED, Candidates, Deadline
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup
 from stlc.controller.search.feasibility import safety_task, solve
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 class Restarts(GuardStage):

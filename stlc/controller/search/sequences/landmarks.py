@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,9 +19,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.normal_form import joined, rejoined, terms
 from stlc.compile.ir.support import columns_in
 from stlc.compile.semantics.tolerance import TOLERANCE
-
-if TYPE_CHECKING:
-    from stlc.signature import Column
+from stlc.signature import Column
 
 VALUES = 1001
 """Number of values of a state at which it is looked up whether two conditions on it exclude each other."""

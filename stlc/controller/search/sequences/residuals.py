@@ -12,9 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
@@ -23,9 +24,6 @@ from stlc.compile.ir.normal_form import joined
 from stlc.compile.ir.support import history
 from stlc.compile.ir.traverse import map_children, nodes, operands
 from stlc.compile.semantics.tolerance import TOLERANCE
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 YES, NO = ir.Truth(True), ir.Truth(False)
 

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
+from stlc.controller.problem.task import Task
+from stlc.controller.run.config import ResolvedConfig
 from stlc.controller.training.config import TrainConfig, base_config
 from stlc.controller.training.learner import NetworkMethod, Trainer
 from stlc.controller.training.objective import Objective, paper_objective
-
-if TYPE_CHECKING:
-    from stlc.controller.problem.task import Task
-    from stlc.controller.run.config import ResolvedConfig
 
 
 class Gradient(NetworkMethod):

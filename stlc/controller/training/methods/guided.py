@@ -8,16 +8,12 @@ its own plan from the same state violates the specification (docs/decisions/0007
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
+from stlc.controller.problem.task import Task
+from stlc.controller.run.config import ResolvedConfig
 from stlc.controller.training.config import TrainConfig, base_config
 from stlc.controller.training.learner import NetworkMethod, Trainer
 from stlc.controller.training.objective import Objective, guided_objective
-
-if TYPE_CHECKING:
-    from stlc.controller.problem.task import Task
-    from stlc.controller.run.config import ResolvedConfig
-
 
 LEARNING_RATE = 3e-3
 """Default peak learning rate."""
