@@ -11,6 +11,7 @@ from typing import ClassVar
 
 from stlc.diagnostics import Diagnostic, SpecError, SystemFileError, UsageError, usage
 from stlc.files import File
+from stlc.grammar.parser import parse
 from stlc.lint.lint import Selection, Surroundings
 from stlc.lint.lint import fix as repair
 from stlc.lint.lint import lint as lint_text
@@ -77,8 +78,6 @@ def lint(
         UsageError: U101, there is no such code; U102, a file is missing.
         SystemFileError: the file of `system` is invalid.
     """
-    from stlc.grammar.parser import parse
-
     given = [files] if isinstance(files, str | Path) else files
     names = File.specs([str(name) for name in given])
     if fix and File.STDIN in names:
@@ -120,8 +119,6 @@ def _surroundings(system: str | None, source: Source) -> Surroundings | None:
 
     Return None if there is none, or if the specification cannot be read.
     """
-    from stlc.grammar.parser import parse
-
     if system is None:
         try:
             system = parse(source).system

@@ -12,7 +12,7 @@ from stlc.activity import PULSE
 from stlc.assurance.bounds import clopper_pearson_lower
 from stlc.assurance.options import VerifyOptions
 from stlc.assurance.verification.around import Around
-from stlc.assurance.verification.verify import ModeResult, Verification
+from stlc.assurance.verification.verify import ModeResult, Verification, Verifier
 from stlc.diagnostics import usage
 from stlc.foreign import driving
 from stlc.jsontext import Num
@@ -123,7 +123,6 @@ def verify(run: Run | Path | str, options: VerifyOptions) -> Verified:
 
     from stlc.assurance.verification.examine import SharedExaminer
     from stlc.assurance.verification.plans import PolicySource
-    from stlc.assurance.verification.verify import Verifier
     from stlc.controller.parallel.workers import LocalProcesses
     from stlc.controller.run.run import Run
     from stlc.controller.training.budget import clock_of

@@ -9,6 +9,7 @@ from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command
 from stlc.escape import visible
 from stlc.export.targets import ExportOptions
+from stlc.export.targets import export as write
 
 if TYPE_CHECKING:
     from stlc.export.monitor import ExportedMonitor
@@ -39,8 +40,6 @@ def export(
     A file `SPEC.stl` with `--to c` is exported without a run: the monitor of streams in C99, with an example
     that reads CSV.
     """
-    from stlc.export.targets import export as write
-
     done = write(run, **options.given())
 
     def show() -> None:

@@ -11,6 +11,7 @@ import typer
 from stlc.cli.framework.output import Answer, emit, say, show_diagnostics, table
 from stlc.cli.framework.program import group, subcommand
 from stlc.escape import visible
+from stlc.files import File
 from stlc.options import Options
 
 if TYPE_CHECKING:
@@ -110,7 +111,6 @@ def _counted(count: int, what: str) -> str:
 
 def _load(name: str, overrides: Mapping[str, str]) -> SystemDecl:
     from stlc.dynamics.load import load_system_decl
-    from stlc.files import File
 
     return load_system_decl(File(name).system(), overrides)
 
@@ -143,7 +143,6 @@ def _all_systems() -> Iterator[ListedSystem]:
     from stlc.diagnostics import StlcError
     from stlc.dynamics.facts import ListedSystem
     from stlc.dynamics.load import load_system_decl
-    from stlc.files import File
 
     seen: set[str] = set()
     for folder in (Path("systems"), Path("examples"), File.SYSTEMS):

@@ -12,6 +12,8 @@ import typer
 from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.output import Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
+from stlc.diagnostics import Diagnostic, SpecError, StlcError, usage
+from stlc.files import File
 from stlc.options import Options
 
 if TYPE_CHECKING:
@@ -60,8 +62,6 @@ def compile_(
     the syntax tree, and --show dot prints it as a graph for Graphviz. Both check only the syntax; `stlc lint`
     also checks names, types and units.
     """
-    from stlc.diagnostics import usage
-
     if show == "ast" or show == "dot":
         from stlc.files import File
 
@@ -88,8 +88,6 @@ def _trees(names: Sequence[str], show: Literal["ast", "dot"]) -> Answer[ParsedFi
     for Graphviz. The syntax errors of all files are raised together.
     """
     from stlc.cli.commands.compile.tree_text import as_dot, as_tree, as_values
-    from stlc.diagnostics import Diagnostic, SpecError
-    from stlc.files import File
     from stlc.grammar.parser import parse
 
     specs, findings = [], list[Diagnostic]()
@@ -109,8 +107,6 @@ def _trees(names: Sequence[str], show: Literal["ast", "dot"]) -> Answer[ParsedFi
 
 def _files(spec: Path, system: str | None) -> list[str]:
     """Files to watch: the specification, and the system file if there is one."""
-    from stlc.diagnostics import StlcError
-    from stlc.files import File
     from stlc.grammar.parser import parse
 
     spec = File(spec).spec()
@@ -136,9 +132,7 @@ def _compiled(
     from stlc.compile.dump import dump
     from stlc.compile.ir.discretize import Grid
     from stlc.compile.pipeline import Purpose, compile_spec
-    from stlc.diagnostics import usage
     from stlc.dynamics.load import load_system_decl
-    from stlc.files import File
     from stlc.grammar.parser import parse
 
     path = File(path).spec()

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 from stlc.controller.guard.kind import named_guard
 from stlc.escape import operand, shell, visible
-from stlc.view.words import listing
+from stlc.view.words import cause_words, listing, satisfied_sentence, seconds, viable_sentence
 
 Record: TypeAlias = "Mapping[str, Any]"
 
@@ -75,8 +75,6 @@ def _drives(document: Record) -> Iterator[str]:
 
     A drive is lost if no satisfying plan was known at its start, or after an exogenous event.
     """
-    from stlc.view.words import satisfied_sentence, viable_sentence
-
     yield f"  {satisfied_sentence(document)}"
     lost = viable_sentence(document)
     if lost:
@@ -108,8 +106,6 @@ def _broken(guard: str, drives: Record, judged: str) -> Iterator[str]:
     closed-loop run of one agent with one seed. Only the first few drives are listed. Viable drives, for which
     a satisfying plan was known, come first. `judged` stands before times.
     """
-    from stlc.view.words import cause_words
-
     violated = f"  violated {named_guard(guard).beside}"
     for each in sorted(drives["broken"], key=lambda each: each["lost"])[:MOST_BROKEN]:
         rules = ", ".join(
@@ -222,8 +218,6 @@ def _progress(guards: Record) -> Iterator[tuple[str, ...]]:
 
 def _times(guards: Record) -> Iterator[tuple[str, ...]]:
     """Table rows with the times of decisions, and of the searches of a planner, which have a budget."""
-    from stlc.view.words import seconds
-
     for label, name in (("decision, median", "median"), ("decision, 99 %", "p99")):
         yield (label, *(seconds(guard["latency"][name]) for guard in guards.values()))
     uses = [guard.get("search") for guard in guards.values()]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
-from stlc.cli.framework.output import console
+from stlc.cli.framework.output import console, tolerate_closed
 from stlc.files import reported
 from stlc.view.simulated import bar
 
@@ -109,7 +109,6 @@ def _opened(where: str) -> TextIO:
 
 def _write(monitor: LiveMonitor, stream: TextIO) -> None:
     """Write the present robustness margins to a stream: one JSON object for each agent, on its own line."""
-    from stlc.cli.framework.output import tolerate_closed
     from stlc.jsontext import dumps
 
     with tolerate_closed(stream):
