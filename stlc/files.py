@@ -168,7 +168,7 @@ class File:
         """True if its name is a pattern (`*`, `?`, `[…]`) and not the path of a file that is called so."""
         return glob.has_magic(str(self.name)) and not Path(self.name).exists()
 
-    def system(self, spec_path: Path | None = None) -> Path:
+    def system(self, spec_path: Path | str | None = None) -> Path:
         """Path of the system file of this name.
 
         The name is tried as a path, then beside the specification, in `systems`, in `examples`, and among the
@@ -179,7 +179,7 @@ class File:
         """
         folders = [Path()]
         if spec_path is not None:
-            folders.append(spec_path.parent)
+            folders.append(Path(spec_path).parent)
         folders += [Path("systems"), Path("examples"), self.SYSTEMS, LIBRARY]
         for folder in folders:
             for suffix in _SYSTEM_SUFFIXES:

@@ -285,5 +285,5 @@ def verify_draws(stored: StoredCertificate, spec: str | None, system: str | None
     if stored.kind == "plant":
         decl = load_plant_decl(named)
         return compared(stored, plant_inputs(text, decl), decl.packages)
-    found = File(str(named)).system(Path(text.source.name))
+    found = File(named).system(text.source.name)
     return compared(stored, system_inputs(text, found, stored.conditions.overrides))

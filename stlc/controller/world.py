@@ -22,7 +22,7 @@ from stlc.dynamics.declaration.deployment import WorldRef
 from stlc.dynamics.system import System
 from stlc.dynamics.uncertainty.disturbance import Events
 from stlc.foreign import module_at
-from stlc.registry import closest
+from stlc.registry import did_you_mean
 
 
 class World(Protocol):
@@ -218,21 +218,22 @@ def _load(reference: WorldRef) -> WorldType:
         raise _refused(reference, f"importing `{path}` fails", f"{type(error).__name__}: {error}") from error
     found = getattr(module, name, None)
     if not isinstance(found, type):
-        guess = closest(name, [key for key, value in vars(module).items() if isinstance(value, type)])
-        advice = f"did you mean `{guess}`?" if guess else ""
-        raise _refused(reference, f"`{path}` has no class `{name}`", advice=advice)
+        classes = [key for key, value in vars(module).items() if isinstance(value, type)]
+        raise _refused(reference, f"`{path}` has no class `{name}`", advice=did_you_mean(name, classes))
     missing = [method for method in _METHODS if not callable(getattr(found, method, None))]
     if missing:
         raise _refused(reference, f"`{name}` in `{path}` is no world: it lacks {', '.join(missing)}")
     return cast(WorldType, found)
 
 
-def _refused(reference: WorldRef, message: str, note: str = "", advice: str = "") -> SystemFileError:
+def _refused(
+    reference: WorldRef, message: str, note: str = "", advice: tuple[str, ...] = ()
+) -> SystemFileError:
     return SystemFileError.of(
         "S206",
         message,
         reference.span,
         label="named here",
         note=(note,) if note else (),
-        help=(advice,) if advice else (),
+        help=advice,
     )

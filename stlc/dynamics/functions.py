@@ -18,7 +18,7 @@ from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.functions import FunctionDecl
 from stlc.dynamics.declaration.init import FileDecl
 from stlc.foreign import module_at, require_driving
-from stlc.registry import closest
+from stlc.registry import did_you_mean
 
 
 def load_functions(decl: SystemDecl) -> Mapping[str, InterfaceFunction]:
@@ -65,8 +65,8 @@ def _loaded(decl: FunctionDecl) -> Callable[..., Array]:
         raise _refused(decl, f"`{decl.module}` cannot be imported", reason) from error
     found = getattr(module, decl.attribute, None)
     if not callable(found):
-        near = closest(decl.attribute, [name for name, value in vars(module).items() if callable(value)])
-        advice = (f"did you mean `{near}`?",) if near else ()
+        functions = [name for name, value in vars(module).items() if callable(value)]
+        advice = did_you_mean(decl.attribute, functions)
         raise _refused(decl, f"`{decl.module}` has no function `{decl.attribute}`", help_=advice)
     return found  # type: ignore[no-any-return]
 

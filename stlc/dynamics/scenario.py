@@ -16,7 +16,7 @@ from stlc.diagnostics import usage
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.deployment import ErrorsDecl, ScenarioDecl
 from stlc.dynamics.load import load_system_decl, parse_system
-from stlc.registry import closest
+from stlc.registry import did_you_mean
 from stlc.source import Source
 
 DISTURBED = ("mismatch-5", "mismatch-10", "mismatch-20", "disturb", "noise")
@@ -60,11 +60,10 @@ def find_scenario(decl: SystemDecl, name: str, *advice: str) -> ScenarioDecl:
     if (usual := standard(name)) is not None:
         return usual
     names = [scenario.name for scenario in decl.scenarios]
-    near = closest(name, [*names, *DISTURBED, "mismatch"])
+    near = did_you_mean(name, [*names, *DISTURBED, "mismatch"])
     listed = f"scenarios of {decl.name}: {', '.join(names)}" if names else f"{decl.name} declares none"
     every = f"every system has {', '.join(DISTURBED)}"
-    help_ = (f"did you mean `{near}`?  {listed}" if near else listed, every)
-    raise usage(f"there is no scenario `{name}`", *help_, *advice)
+    raise usage(f"there is no scenario `{name}`", "  ".join((*near, listed)), every, *advice)
 
 
 def scenario_constants(

@@ -114,7 +114,7 @@ class System:
 
         Raises UsageError if it does not exist, SystemFileError if it is invalid.
         """
-        found = path if isinstance(path, Source) else File(str(path)).system()
+        found = path if isinstance(path, Source) else File(path).system()
         decl = load_system_decl(found, overrides or {})
         return cls(decl if scenario is None else under(decl, scenario))
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from stlc.diagnostics import CODES, Diagnostic
 from stlc.grammar.scan import comments, declaration_starts, lexemes
-from stlc.registry import closest
+from stlc.registry import did_you_mean
 from stlc.source import Source, Span
 
 _DIRECTIVE = re.compile(r"(?:#+|/{2,})[ \t]*stlc:[ \t]*(?P<word>\w*)(?P<codes>(?:[ \t,]+[A-Za-z]\d+\b)*)")
@@ -69,9 +69,8 @@ def misunderstood(source: Source) -> Iterator[Diagnostic]:
         for code in codes:
             known = code.text.upper()
             if known not in CODES:
-                near = closest(known, CODES)
-                advice = f"did you mean `{near}`?" if near else "stlc explain  lists the codes"
-                yield Diagnostic("W319", f"there is no code `{known}`", code, help=(advice,))
+                advice = did_you_mean(known, CODES, "stlc explain  lists the codes")
+                yield Diagnostic("W319", f"there is no code `{known}`", code, help=advice)
             elif not known.startswith("W"):
                 yield Diagnostic("W319", f"`{known}` is an error; only warnings can be allowed", code)
 

@@ -12,7 +12,6 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.environments import MOST, Environments, Transition
 from stlc.controller.problem.environments import Reward as EpisodeReward
 from stlc.controller.problem.load import load_task, require_controls
@@ -193,7 +192,7 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             "state": moved.states.numpy(force=True),
             "robustness": self._marked(robustness),
             "rho": rho.numpy(force=True),
-            "satisfied": TOLERANCE.satisfied(verdicts.rho).numpy(force=True),
+            "satisfied": verdicts.satisfied.numpy(force=True),
         }
         return self._marked(end)
 

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stlc.compile.frontend.interface import Interface
@@ -80,7 +79,7 @@ def given_times(dt: float | Fraction | None, horizon: float | Fraction | None) -
 def _declared(name: str | Source, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[Times, SystemDecl]:
     from stlc.dynamics.load import load_system_decl
 
-    found = name if isinstance(name, Source) else File(name).system(Path(spec.source.name))
+    found = name if isinstance(name, Source) else File(name).system(spec.source.name)
     decl = load_system_decl(found, overrides)
     return Times(decl.dt, decl.dt * decl.horizon), decl
 
@@ -110,7 +109,7 @@ def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:
     if spec.system is None or spec.library is not None:
         return None
     try:
-        File(spec.system).system(Path(spec.source.name))
+        File(spec.system).system(spec.source.name)
     except UsageError:
         return None
     return _declared(spec.system, spec, overrides)[0]

@@ -22,7 +22,7 @@ from stlc.monitor.facts.fact import Fact
 from stlc.monitor.prepared import Floats, Part, Prepared, Timeline
 from stlc.monitor.signals import Gap
 from stlc.provenance import sha256
-from stlc.registry import closest
+from stlc.registry import did_you_mean
 from stlc.source import Source
 from stlc.tabular import frame, html_table, plot
 from stlc.trace.recording import Clock
@@ -728,11 +728,10 @@ def require_known(names: Sequence[str], known: Sequence[str]) -> None:
         raise usage("requirements are a list of names", f'["{names}"]')
     for name in names:
         if name not in known:
-            near = closest(name, known)
             raise UsageError.of(
                 "U101",
                 f"there is no requirement `{name}`",
-                help=(f"did you mean `{near}`?",) if near else (),
+                help=did_you_mean(name, known),
                 note=(f"requirements: {', '.join(known)}",),
             )
 

@@ -130,6 +130,6 @@ def _surroundings(system: str | None, source: Source) -> Surroundings | None:
     from stlc.compile.pipeline import Purpose
     from stlc.dynamics.load import load_system_decl
 
-    decl = load_system_decl(File(system).system(Path(source.name)))
+    decl = load_system_decl(File(system).system(source.name))
     purpose: Purpose = "check" if decl.judges_by(Path(source.name)) else "train"
     return Surroundings(decl.interface(), Grid(decl.dt, decl.horizon), purpose)

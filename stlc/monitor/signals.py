@@ -29,7 +29,7 @@ from stlc.escape import shell, visible
 from stlc.grammar import ast
 from stlc.monitor.cells import Cells
 from stlc.monitor.given import CLOCKS, UNNAMED, Given
-from stlc.registry import closest
+from stlc.registry import closest, did_you_mean
 from stlc.signature import Column, Kind
 from stlc.source import Span
 from stlc.trace import AS_IT_IS, Reading, Trace
@@ -144,8 +144,7 @@ def _require_signals(requested: Reading, spec: ast.Spec, columns: Mapping[str, s
     for option, names in (("--map", requested.names), ("--between", requested.between)):
         for name in names:
             if name not in known and name.partition("[")[0] not in known:
-                near = closest(name, declared)
-                help_ = (f"did you mean `{near}`?",) if near else ()
+                help_ = did_you_mean(name, declared)
                 note = (f"signals: {', '.join(declared)}",)
                 message = f"`{option} {name}=…`: the specification has no signal `{name}`"
                 findings.append(Diagnostic("U101", message, help=help_, note=note))

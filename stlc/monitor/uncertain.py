@@ -24,7 +24,7 @@ from stlc.diagnostics import Diagnostic, UsageError
 from stlc.grammar import ast
 from stlc.jsontext import Num
 from stlc.monitor.values import Record
-from stlc.registry import closest
+from stlc.registry import did_you_mean
 from stlc.signature import Column
 from stlc.units import Unit
 
@@ -129,8 +129,7 @@ def _misfit(
     vectors = {_INDEX.sub("", key): column for key, column in columns.items()}
     known = columns.get(name) or vectors.get(name)
     if known is None:
-        near = closest(name, {**columns, **vectors})
-        help_ = (f"did you mean `{near}`?",) if near else ()
+        help_ = did_you_mean(name, {**columns, **vectors})
         note = (f"signals: {', '.join(columns)}",)
         return Diagnostic("U101", f"`--uncertain {name}=…`: no signal `{name}`", help=help_, note=note)
     signals = (item for item in spec.items if isinstance(item, (ast.Signal, ast.Param)))

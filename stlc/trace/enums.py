@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
-from stlc.registry import closest
+from stlc.registry import did_you_mean
 from stlc.signature import Column
 from stlc.trace.formats.cells import value_of
 from stlc.trace.recording import ClockGroup, Recording
@@ -126,6 +126,5 @@ def _unknown(trace: str, name: str, word: str, words: Words) -> Diagnostic:
         )
         return Diagnostic("E603", f"`{name}` in `{trace}` holds words (`{shown}`), not numbers", help=advice)
     note = (f"it is one of {', '.join(words)}, or a number",)
-    near = closest(word, words)
-    advice = (f"did you mean `{near}`?",) if near else ()
+    advice = did_you_mean(word, words)
     return Diagnostic("E603", f"`{name}` in `{trace}` cannot be `{shown}`", help=advice, note=note)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
-from stlc.registry import closest
+from stlc.registry import did_you_mean
 from stlc.signature import MAX_COMPONENTS, Column
 from stlc.source import Span
 from stlc.trace.meta import TraceMeta
@@ -215,11 +215,10 @@ class Recording:
 def absent(trace: str, signal: str, known: Iterable[str]) -> Diagnostic:
     """Finding E601: the trace has no such signal."""
     names = list(known)
-    near = closest(signal, names)
     return Diagnostic(
         "E601",
         f"trace `{trace}` has no signal `{signal}`",
-        help=(f"did you mean `{near}`?",) if near else (),
+        help=did_you_mean(signal, names),
         note=(f"signals in {trace}: {', '.join(names[:_SHOWN])}{', …' if len(names) > _SHOWN else ''}",),
     )
 

@@ -71,4 +71,4 @@ def _specification(path: Path) -> str:
         return File(path).read().text
     from stlc.trace import read_recording
 
-    return read_recording(File(str(path)).trace()).meta.carried.text
+    return read_recording(File(path).trace()).meta.carried.text

@@ -66,7 +66,7 @@ def _identity(path: Path | str | None) -> object:
     if path is None or str(path) == File.STDIN:
         return None
     try:
-        target = File(Path(path)).real
+        target = File(path).real
         found = target.stat()
     except FileNotFoundError:
         return target

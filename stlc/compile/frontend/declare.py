@@ -29,7 +29,7 @@ from stlc.compile.ir.functions import FUNCTIONS, callable_names, sampler_names
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
 from stlc.grammar.words import BUILT_IN
-from stlc.registry import closest
+from stlc.registry import closest, did_you_mean
 from stlc.signature import MAX_COMPONENTS, Column, Kind, Role
 from stlc.source import Span
 from stlc.units import Unit, nearest
@@ -123,8 +123,7 @@ def _check_extern_type(written: ast.TypeRef, scope: Scope) -> None:
 
 
 def _absent_function(item: ast.Extern, interface: Interface) -> Diagnostic:
-    near = closest(item.name, interface.externs)
-    hint = (f"did you mean `{near}`?",) if near is not None else ()
+    hint = did_you_mean(item.name, interface.externs)
     line = f'functions: {{{item.name}: {{kind: python, target: "package.module:{item.name}"}}}}'
     return Diagnostic(
         "E107",
@@ -175,8 +174,7 @@ def check_type(type_: ast.TypeRef | None, enums: Mapping[str, Labels], scope: Sc
     if type_ is None:
         return
     if type_.name not in _KINDS and type_.name not in enums and type_.name != "formula":
-        near = closest(type_.name, (*_KINDS, *enums))
-        help_ = (f"did you mean `{near}`?",) if near is not None else ("types: real, int, bool, or an enum",)
+        help_ = did_you_mean(type_.name, (*_KINDS, *enums), "types: real, int, bool, or an enum")
         scope.fail(Diagnostic("E101", f"unknown type `{type_.name}`", type_.span, help=help_))
     if type_.size is not None and not 1 <= type_.size <= MAX_COMPONENTS:
         message = f"a vector has between 1 and {MAX_COMPONENTS} components"

@@ -45,7 +45,7 @@ from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
 from stlc.grammar.traverse import children, descendants
 from stlc.grammar.words import BINARY_TEMPORAL, OPERATORS
-from stlc.registry import closest
+from stlc.registry import did_you_mean
 from stlc.signature import Kind
 from stlc.source import Source, Span
 from stlc.units import Unit, nearest
@@ -71,10 +71,9 @@ def _module(expr: ast.Expr, scope: Scope) -> Scope:
             outer = _module(base, scope)
             if name in outer.modules:
                 return outer.modules[name]
-    near = closest(expr.span.text, scope.modules)
-    hint = f"did you mean `{near}`?" if near is not None else 'import "file.stl" as m, or import std'
+    help_ = did_you_mean(expr.span.text, scope.modules, 'import "file.stl" as m, or import std')
     return scope.fail(
-        Diagnostic("E101", f"`{expr.span.text}` is not an imported file", expr.span, help=(hint,))
+        Diagnostic("E101", f"`{expr.span.text}` is not an imported file", expr.span, help=help_)
     )
 
 

@@ -130,7 +130,7 @@ def _defined_at(world: object, method: str) -> Span | None:
 def _line(file: str, number: int) -> Span | None:
     """Location of line `number` of a file, without surrounding blanks; None if the line cannot be read."""
     try:
-        text = File(Path(file)).read().text
+        text = File(file).read().text
     except StlcError:
         return None
     near = os.path.relpath(file)

@@ -27,6 +27,7 @@ from stlc.grammar.parser import parse
 from stlc.jsontext import Count
 from stlc.monitor.explain.report import explain
 from stlc.monitor.verdict import Monitor
+from stlc.rundir import RunDir
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
     from stlc.dynamics.declaration.decl import SystemDecl
     from stlc.dynamics.declaration.deployment import JudgeRef
     from stlc.monitor.judgement import Verdict
-    from stlc.rundir import RunDir
 
 JUDGE = "judge"
 _INDEX = f"{JUDGE}/{RunDir.INDEX}"

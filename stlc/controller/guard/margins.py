@@ -27,7 +27,7 @@ from stlc.controller.problem.task import Task
 from stlc.diagnostics import usage
 from stlc.dynamics.model.samplers import seeded
 from stlc.dynamics.uncertainty.disturbance import Disturbance
-from stlc.registry import GUARDS, closest
+from stlc.registry import GUARDS, did_you_mean
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement
@@ -168,10 +168,8 @@ class MarginRequest:
         names = [rule.name for rule in task.compiled.safety]
         for name in self.named:
             if name not in names:
-                near = closest(name, names)
-                help_ = (f"did you mean `{near}`?",) if near else ()
                 listed = f"safety requirements: {', '.join(names) or 'none'}"
-                raise usage(f"`{name}` is no safety requirement", *help_, listed)
+                raise usage(f"`{name}` is no safety requirement", *did_you_mean(name, names), listed)
         found = dict.fromkeys(names, self.every)
         kind = GUARDS.get(guard)
         if self.share is not None and kind.intervenes:

@@ -19,7 +19,6 @@ from typing import Literal, Self
 import torch
 from torch import Tensor, nn
 
-from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.environments import observe
 from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.dynamics.declaration.schema.names import ControlDecl
@@ -417,7 +416,7 @@ class BestOfKPolicy(Policy):
     @torch.no_grad()
     def plan_judged(self, x0: Tensor, rest: Tensor | None = None) -> tuple[Tensor, PlanVerdicts]:
         plans, judged = super().plan_judged(x0, rest)
-        failing = (~TOLERANCE.satisfied(judged.rho)).nonzero()[:, 0]
+        failing = (~judged.satisfied).nonzero()[:, 0]
         if not len(self.network.changes) or not len(failing):
             return plans, judged
         size = max(1, MOST_STEPS // (plans.shape[1] * (1 + len(self.network.changes))))

@@ -55,12 +55,12 @@ def load_task(
         SpecError: the specification is invalid or does not fit the system.
         SystemFileError: the system file is invalid.
     """
-    path = File(Path(spec)).spec()
+    path = File(spec).spec()
     parsed = parse(File(path).read())
     wanted = system if system is not None else parsed.system
     if wanted is None:
         raise usage(f"`{path}` names no system", hint, 'or a line `system "FILE"` in the specification')
-    there = File(str(wanted)).system(path)
+    there = File(wanted).system(path)
     if found is not None:
         found(there)
     changed = dict(overrides or {})

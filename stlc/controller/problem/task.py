@@ -66,6 +66,11 @@ class PlanVerdicts:
     plans: Tensor
     columns: Mapping[str, Tensor]
 
+    @property
+    def satisfied(self) -> Tensor:
+        """Whether each plan satisfies the specification, (batch,)."""
+        return TOLERANCE.satisfied(self.rho)
+
     def of(self, index: Tensor) -> PlanVerdicts:
         """The verdicts on the plans with indices `index`, (k,)."""
         columns = {name: column[:, index] for name, column in self.columns.items()}

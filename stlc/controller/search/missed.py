@@ -86,7 +86,7 @@ def better_planner(task: Task, x0: Tensor, tried: str, seconds: float) -> Better
             found = plan(task, states, name, budget=PlanBudget(limit))
         except StlcError:  # it cannot plan for this task, or its package is missing
             continue
-        good = int(TOLERANCE.satisfied(found.rho).sum())
+        good = int(found.satisfied.sum())
         if good:
             return BetterPlanner(name, good, len(states), float(found.seconds.mean()))
     return None

@@ -16,7 +16,7 @@ from torch import Tensor
 from stlc.compile.frontend.modules import library_of, spec_sha256
 from stlc.diagnostics import UsageError, usage
 from stlc.grammar import ast
-from stlc.registry import closest
+from stlc.registry import did_you_mean
 from stlc.trace import Reading, Trace, TraceMeta
 from stlc.trace.enums import words_of
 from stlc.trace.recording import conversion
@@ -77,10 +77,8 @@ def _assignment(task: Task, part: str) -> tuple[str, float]:
     """
     name, _, value = (each.strip() for each in part.partition("="))
     if name not in task.system.names:
-        near = closest(name, task.system.names)
-        known = f"states: {', '.join(task.system.names)}"
-        advice = known if near is None else f"did you mean `{near}`?  {known}"
-        raise usage(f"`{task.system.decl.name}` has no state `{name}`", advice)
+        near, known = did_you_mean(name, task.system.names), f"states: {', '.join(task.system.names)}"
+        raise usage(f"`{task.system.decl.name}` has no state `{name}`", "  ".join((*near, known)))
     column = task.system.signature[name]
     words = words_of(column)
     word = value.lower() if column.kind == "bool" else value

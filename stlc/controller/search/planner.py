@@ -22,7 +22,7 @@ from stlc.controller.options import value_of
 from stlc.controller.problem.rows import Rows
 from stlc.diagnostics import usage
 from stlc.native import Stop, never
-from stlc.registry import PLANNERS, closest
+from stlc.registry import PLANNERS, did_you_mean
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
@@ -287,9 +287,8 @@ def planner_named(name: str, **options: Any) -> Planner:
     values = {}
     for key, value in options.items():
         if key not in known:
-            near = closest(key, known)
             listed = f"options: {', '.join(known)}" if known else "it has none"
-            advice = listed if near is None else f"did you mean `{near}`?  {listed}"
+            advice = "  ".join((*did_you_mean(key, known), listed))
             raise usage(f"planner `{name}` has no option `{key}`", advice)
         values[key] = value_of(f"planner `{name}`", known[key], value)
     planner: Planner = kind(**values)

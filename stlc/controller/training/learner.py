@@ -247,7 +247,7 @@ class Trainer(Learner):
         """
         x0 = self.supply.take(self.config.pool)
         plans, judged = BestOfKPolicy(self.task, self.network).plan_judged(x0)
-        good = TOLERANCE.satisfied(judged.rho)
+        good = judged.satisfied
         fresh = Validation.of(judged)
         accuracy = fresh.accuracy
         self.next_validation = self.step + self.config.every
@@ -297,7 +297,7 @@ class Trainer(Learner):
             return x0, plans
         kept = self.failures.drawn(self.config.pool // DRIVEN, self.generator)
         tried, judged = BestOfKPolicy(self.task, self.network).plan_judged(kept)
-        rows = (~TOLERANCE.satisfied(judged.rho)).nonzero()[:, 0][: max(self._effort[0] // DRIVEN, 1)]
+        rows = (~judged.satisfied).nonzero()[:, 0][: max(self._effort[0] // DRIVEN, 1)]
         self.failures.repairing = len(rows)
         return torch.cat((x0, kept[rows])), torch.cat((plans, tried[rows].to(plans)))
 
@@ -417,7 +417,7 @@ class Trainer(Learner):
             return first, torch.zeros_like(first, dtype=torch.bool)
         judged = self.task.judge(x0.repeat_interleave(count, 0), plans.flatten(0, 1))
         score = self.task.rank(judged, safety=False).view(batch, count)
-        return score.argmax(1), TOLERANCE.satisfied(judged.rho).view(batch, count).any(1)
+        return score.argmax(1), judged.satisfied.view(batch, count).any(1)
 
     def _imitation(self, plans: Tensor, targets: Tensor, solved: Tensor) -> Tensor:
         """Imitation loss of the states for which a search has found a plan, ().

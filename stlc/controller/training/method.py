@@ -116,9 +116,7 @@ class Validation:
     def of(cls, judged: PlanVerdicts) -> Validation:
         """Make the result of a validation without search, from the verdicts `judged` on the plans."""
         shares = TOLERANCE.satisfied(judged.requirements).double().mean(0)
-        return cls(
-            float(TOLERANCE.satisfied(judged.rho).double().mean()), tuple(float(share) for share in shares)
-        )
+        return cls(float(judged.satisfied.double().mean()), tuple(float(share) for share in shares))
 
     def mean(self, ranks: Ranks) -> Validation:
         """Combine the results of all ranks: shares are averaged, counts are summed.

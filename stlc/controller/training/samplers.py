@@ -19,7 +19,6 @@ from typing import ClassVar, TypeAlias
 import torch
 from torch import Tensor
 
-from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.dynamics.uncertainty.disturbance import Events
 
@@ -171,7 +170,7 @@ class Missions(Supply):
             self.pool = self._surprised(self._at(judged, legs - 1), self.pool, now + legs)
         seen = torch.cat((*glimpses, self.pool))
         seen = seen[self.task.alive(seen)]
-        failing = ~TOLERANCE.satisfied(judged.rho)
+        failing = ~judged.satisfied
         given_up = failing & (self._rand(len(failing)) < GIVE_UP)
         ended = (self.age > self.task.mission_steps) | ~self.task.alive(self.pool) | given_up
         place = ended.nonzero()[:, 0]

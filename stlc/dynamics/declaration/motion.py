@@ -31,7 +31,7 @@ from stlc.dynamics.declaration.schema.record import (
 )
 from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Mapping, Node, Scalar
 from stlc.dynamics.declaration.schema.yaml_nodes import Sequence as ListNode
-from stlc.registry import closest
+from stlc.registry import did_you_mean
 from stlc.signature import Column
 from stlc.units import Unit
 
@@ -148,9 +148,8 @@ def states_of(entry: Entry, where: str, cx: Context) -> tuple[Column, ...]:
     if columns:
         return columns
     states = cx.names.states
-    near = closest(name, states)
-    guess = f"did you mean `{near}`?" if near else f"states: {', '.join(states)}"
-    cx.reader.report("S202", f"{where} sets `{name}`, which is not a state", entry.key.span, guess)
+    advice = did_you_mean(name, states, f"states: {', '.join(states)}")
+    cx.reader.report("S202", f"{where} sets `{name}`, which is not a state", entry.key.span, *advice)
     return ()
 
 

@@ -355,7 +355,7 @@ def extended(root: Mapping, reader: Reader) -> tuple[Mapping, tuple[Source, ...]
     source location. S209 is reported if a file cannot be read or extends itself.
     """
     sources: list[Source] = []
-    seen = {File(Path(reader.source.name)).real}
+    seen = {File(reader.source.name).real}
     chain = [root]
     while (node := chain[-1].get(_EXTENDS)) is not None:
         text = reader.text(node, f"`{_EXTENDS}`")

@@ -14,7 +14,7 @@ from stlc.grammar.errors.failure import ParseFailure
 from stlc.grammar.errors.units import unit_advice
 from stlc.grammar.scan import CLOSES, Lexeme, brackets, closes
 from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, OPERATORS, RESERVED, ROLES, UNARY_TEMPORAL
-from stlc.registry import closest
+from stlc.registry import closest, did_you_mean
 from stlc.source import Span
 from stlc.units import Unit
 
@@ -119,13 +119,12 @@ def unknown_declaration(failure: ParseFailure) -> Diagnostic | None:
         return None
     if not _begins_line(failure, found):
         return None
-    near = closest(found.text, (*DECLARATIONS, *ROLES, "spec", "system", "time"))
-    advice = f"did you mean `{near}`?  " if near else ""
+    near = did_you_mean(found.text, (*DECLARATIONS, *ROLES, "spec", "system", "time"))
     return Diagnostic(
         "E010",
         f"expected a declaration, found `{found.text}`",
         failure.of(found),
-        help=(f"{advice}declarations: {' '.join(DECLARATIONS)}",),
+        help=("  ".join((*near, f"declarations: {' '.join(DECLARATIONS)}")),),
     )
 
 

@@ -9,7 +9,7 @@ from typing import TypeVar
 from stlc.diagnostics import Diagnostic, Findings, Label, SystemFileError, tell
 from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence
 from stlc.escape import unseen
-from stlc.registry import closest
+from stlc.registry import did_you_mean
 from stlc.source import Source, Span
 
 V = TypeVar("V")
@@ -100,13 +100,12 @@ class Reader:
 
         `where` names the mapping in the message.
         """
-        near = closest(key.text, known)
-        guess = f"did you mean `{near}`?  " if near else ""
+        listed = f"keys of {where}: {', '.join(known)}"
         self.report(
             code,
             f"unknown key `{key.text}` in {where}",
             key.span,
-            f"{guess}keys of {where}: {', '.join(known)}",
+            "  ".join((*did_you_mean(key.text, known), listed)),
         )
 
     def items(self, node: Node | None, where: str) -> tuple[Node, ...]:
@@ -216,11 +215,10 @@ class Reader:
         word = self.text(node, where)
         if node is None or word is None or word in options:
             return word
-        near = closest(word, options)
-        guess = f"did you mean `{near}`?" if near else ""
+        guess = did_you_mean(word, options)
         if moved and word in moved:
-            guess = f"it is a file of the repository now: --method {moved[word]}"
-        self.wrong(node, where, " or ".join(f"`{option}`" for option in options), guess)
+            guess = (f"it is a file of the repository now: --method {moved[word]}",)
+        self.wrong(node, where, " or ".join(f"`{option}`" for option in options), *guess)
         return None
 
 
