@@ -12,7 +12,6 @@ from typing import Any
 from stlc.compile.frontend.modules import library_of
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import Diagnostic, UsageError
-from stlc.dynamics.functions import function_files
 from stlc.dynamics.system import System
 from stlc.files import File, alone_in
 from stlc.grammar.parser import parse
@@ -146,7 +145,7 @@ def inputs_of(task: Task) -> dict[str, str]:
     """Return hashes of the specification (with imports) and of the system's parts that affect training."""
     spec, decl = task.compiled.spec, task.system.decl
     texts = [spec.source.text, *(f"{key}\n{text}" for key, text in sorted(library_of(spec).items()))]
-    named = (f"{name} {sha256(path.read_bytes())}" for name, path in sorted(function_files(decl).items()))
+    named = (f"{name} {sha256(path.read_bytes())}" for name, path in sorted(decl.files.items()))
     return {
         "spec_sha256": sha256("\0".join(texts)),
         "system_sha256": sha256("\0".join([decl.learnt, *named])),

@@ -30,7 +30,7 @@ from stlc.diagnostics import StlcError
 from stlc.options import Clock
 from stlc.provenance import sha256
 from stlc.registry import METHODS
-from stlc.rundir import RunDir, every_run
+from stlc.rundir import RunDir
 from stlc.view.held_out import load_held_out
 
 CURVE_POINTS = 80
@@ -190,7 +190,7 @@ class Place:
 
         The result is None if there is no run, or if the newest run failed or has no checkpoint.
         """
-        runs = every_run(self.runs_of(key))
+        runs = RunDir.every(self.runs_of(key))
         if not runs or not (runs[-1].path / "ckpt" / "last.json").is_file():
             return None
         try:

@@ -189,7 +189,7 @@ class RunDir:
         linked = root / RunDir.LATEST
         if (linked / RECORD).is_file():
             return _resolved(linked)
-        runs = sorted(every_run(root), key=lambda run: run.path.stat().st_mtime)
+        runs = sorted(RunDir.every(root), key=lambda run: run.path.stat().st_mtime)
         if not runs:
             help_ = ("train one: stlc train specs/traffic.stl --system car.yaml",)
             raise UsageError.of("R101", f"there is no run in `{root}`", help=help_)
@@ -224,6 +224,60 @@ class RunDir:
             run = _resolved(folder)
             return run if (run.path / RECORD).is_file() else run.checked()
         return cls.newest(root) if str(where) == RunDir.LATEST else _by_name(str(where), root)
+
+    @classmethod
+    def every(cls, root: Path = RUNS) -> list[RunDir]:
+        """Runs below `root` that have a record (`run.json`), ordered by specification and number."""
+        numbered = [
+            (path.parent.name, int(match[1]), path)
+            for path in root.glob("*/*")
+            if (match := _NUMBERED.fullmatch(path.name))
+            and not (path.is_symlink() or path.parent.is_symlink())
+        ]
+        return [cls(path) for _, _, path in sorted(numbered) if (path / RECORD).is_file()]
+
+    @classmethod
+    def recorded_trace(cls, what: str, runs: Path) -> Path:
+        """Return the path of the trace file `what`, or of the trace in the run called `what`.
+
+        Raises:
+            UsageError: U102, there is no such trace or run, or the run has no trace.
+        """
+        try:
+            if not Path(what).is_dir():
+                return File(what).trace(runs)
+        except UsageError as missing:
+            try:
+                folder = cls.open(what, runs)
+            except StlcError:
+                raise missing from None
+        else:
+            folder = cls.open(what, runs)
+        if not folder.has(RunDir.TRACE):
+            advice = (f"record one: {shell(('stlc', 'simulate', folder.name))}",)
+            raise UsageError.of("U102", f"`{folder.shown}` has no trace", help=advice)
+        folder.file(RunDir.TRACE, RunDir.MOST_ARRAYS)
+        return Path(folder.shown) / RunDir.TRACE
+
+    def remove(self) -> None:
+        """Delete the folder; links `latest` to it are redirected to the newest remaining self.
+
+        Raises:
+            MissingError: R201, the folder cannot be deleted.
+        """
+        home = self.path.parent
+        with reported(f"remove `{self.shown}`"):
+            shutil.rmtree(self.path)
+        runs = RunDir.every(home.parent)
+        for folder in (home, home.parent):
+            link = folder / RunDir.LATEST
+            if not link.is_symlink() or link.exists():
+                continue
+            left = [entry for entry in runs if folder in entry.path.parents]
+            link.unlink()
+            if left:
+                newest = max(left, key=lambda entry: entry.path.stat().st_mtime)
+                _point(link, newest.path.relative_to(folder).as_posix())
 
     def checked(self) -> RunDir:
         """Return this run if its record (`run.json`) can be read. Raises RunError (R101) if not."""
@@ -416,16 +470,6 @@ def of_kind(text: bytes, kind: Any) -> Any:
     return found
 
 
-def every_run(root: Path = RunDir.RUNS) -> list[RunDir]:
-    """Runs below `root` that have a record (`run.json`), ordered by specification and number."""
-    numbered = [
-        (path.parent.name, int(match[1]), path)
-        for path in root.glob("*/*")
-        if (match := _NUMBERED.fullmatch(path.name)) and not (path.is_symlink() or path.parent.is_symlink())
-    ]
-    return [RunDir(path) for _, _, path in sorted(numbered) if (path / RECORD).is_file()]
-
-
 def _resolved(folder: Path) -> RunDir:
     """Return the run in a folder; a link `latest` is followed only to a run below its own folder.
 
@@ -438,27 +482,6 @@ def _resolved(folder: Path) -> RunDir:
     return RunDir(path)
 
 
-def remove_run(run: RunDir) -> None:
-    """Delete the folder of a run; links `latest` to it are redirected to the newest remaining run.
-
-    Raises:
-        MissingError: R201, the folder cannot be deleted.
-    """
-    home = run.path.parent
-    with reported(f"remove `{run.shown}`"):
-        shutil.rmtree(run.path)
-    runs = every_run(home.parent)
-    for folder in (home, home.parent):
-        link = folder / RunDir.LATEST
-        if not link.is_symlink() or link.exists():
-            continue
-        left = [entry for entry in runs if folder in entry.path.parents]
-        link.unlink()
-        if left:
-            newest = max(left, key=lambda entry: entry.path.stat().st_mtime)
-            _point(link, newest.path.relative_to(folder).as_posix())
-
-
 def now() -> str:
     """The current time in UTC, in the format of run records and traces."""
     return datetime.now(UTC).isoformat(timespec="seconds")
@@ -468,7 +491,7 @@ def now() -> str:
 
 
 def _by_name(where: str, root: Path) -> RunDir:
-    runs = every_run(root)
+    runs = RunDir.every(root)
     if any(run.path.parent.name == where for run in runs):
         return [run for run in runs if run.path.parent.name == where][-1]
     spec, _, wanted = where.rpartition("/")
@@ -491,7 +514,7 @@ def _of_spec(path: Path, root: Path) -> RunDir:
     Raises:
         UsageError: R101, there is no such run either.
     """
-    runs = every_run(root)
+    runs = RunDir.every(root)
     trained = [run for run in runs if _spec_path(run) == path.resolve()]
     found = trained or [run for run in runs if run.path.parent.name == _slug(path.stem)]
     if not found:
@@ -614,26 +637,3 @@ def draw_words() -> str:
     import secrets
 
     return f"{secrets.choice(_ADJECTIVES.split())}-{secrets.choice(_ANIMALS.split())}"
-
-
-def recorded_trace(what: str, runs: Path) -> Path:
-    """Return the path of the trace file `what`, or of the trace in the run called `what`.
-
-    Raises:
-        UsageError: U102, there is no such trace or run, or the run has no trace.
-    """
-    try:
-        if not Path(what).is_dir():
-            return File(what).trace(runs)
-    except UsageError as missing:
-        try:
-            folder = RunDir.open(what, runs)
-        except StlcError:
-            raise missing from None
-    else:
-        folder = RunDir.open(what, runs)
-    if not folder.has(RunDir.TRACE):
-        advice = (f"record one: {shell(('stlc', 'simulate', folder.name))}",)
-        raise UsageError.of("U102", f"`{folder.shown}` has no trace", help=advice)
-    folder.file(RunDir.TRACE, RunDir.MOST_ARRAYS)
-    return Path(folder.shown) / RunDir.TRACE

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from stlc.jsontext import Num
 from stlc.units import Unit
 
 Kind = Literal["real", "int", "bool", "enum"]
 Role = Literal["input", "output", "state", "env", "timer"]
-
-MAX_COMPONENTS = 4096
-"""Most components of a vector."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +38,16 @@ class Column:
     high: Num | None = None
     labels: tuple[tuple[str, float], ...] = ()
     fact: bool = False
+
+    MAX_COMPONENTS: ClassVar = 4096
+    """Most components of a vector."""
+    TRUTH: ClassVar = dict.fromkeys(("true", "yes", "on"), 1.0) | dict.fromkeys(("false", "no", "off"), 0.0)
+    """Words for truth values, in any case."""
+
+    @property
+    def words(self) -> Mapping[str, float]:
+        """Words for its values: the labels of an enum, or those for truth values; else none."""
+        return self.TRUTH if self.kind == "bool" else dict(self.labels)
 
 
 @dataclass(frozen=True, slots=True)

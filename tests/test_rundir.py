@@ -11,7 +11,7 @@ import pytest
 
 import stlc.rundir
 from stlc.diagnostics import MissingError, RunError, StlcError, UsageError
-from stlc.rundir import RunDir, every_run
+from stlc.rundir import RunDir
 
 
 @pytest.fixture
@@ -223,7 +223,7 @@ def test_a_folder_without_a_record_is_no_run(tmp_path):
 def test_runs_are_in_the_order_of_their_numbers(root):
     for name in ("10000-b", "9999-a", "0010-c"):
         RunDir(root / "traffic" / name).write_json("run.json", {})
-    assert [run.name for run in every_run(root)] == ["0010-c", "9999-a", "10000-b"]
+    assert [run.name for run in RunDir.every(root)] == ["0010-c", "9999-a", "10000-b"]
     assert RunDir.open("traffic", root).name == "10000-b"
 
 
@@ -231,7 +231,7 @@ def test_only_runs_are_listed(root):
     run = made(root, "traffic", "red-fox")
     (root / "traffic" / "notes").mkdir()
     RunDir.create(root, "traffic")
-    assert every_run(root) == [run]
+    assert RunDir.every(root) == [run]
 
 
 # ---------------------------------------------------------------------- records
@@ -350,7 +350,7 @@ def test_latest_leads_to_a_run_below_its_folder_alone(root, tmp_path):
     for where in ("latest", root / "latest"):
         with pytest.raises(RunError, match=r"R110.*leads out of its folder"):
             RunDir.found(where, root)
-    assert [each.path for each in every_run(root)] == [run.path]
+    assert [each.path for each in RunDir.every(root)] == [run.path]
     with pytest.raises(UsageError):
         RunDir.found("far-fox", root)
 

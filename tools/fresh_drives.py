@@ -15,7 +15,7 @@ import torch
 from stlc.controller.deployment.batched import Setting
 from stlc.controller.evaluation.closed_loop import closed_loop
 from stlc.controller.evaluation.deployment import deploy
-from stlc.controller.evaluation.rules import rules_of
+from stlc.controller.evaluation.rules import Rules
 from stlc.controller.run.run import Run
 
 
@@ -24,7 +24,7 @@ def fresh_drives(run: Run, guard: str, drives: int) -> tuple[int, int]:
     test = run.task.system.decl.test
     seeds = tuple(range(-(-drives // test.agents)))
     setting = Setting(seeds, test.agents, test.steps, test.replan, limit=None)
-    obeyed = deploy(run.task, run.policy, setting, guard, rules=rules_of(run)).runs.obeyed
+    obeyed = deploy(run.task, run.policy, setting, guard, rules=Rules.of(run)).runs.obeyed
     return int(obeyed.sum()), len(obeyed)
 
 

@@ -32,7 +32,7 @@ from stlc.assurance.verification.verify import Verifier
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.problem.load import load_task
+from stlc.controller.problem.task import Task
 from stlc.controller.training.budget import clock_of
 from stlc.diagnostics import usage
 from stlc.files import File
@@ -213,7 +213,7 @@ def _verified(case: Case, models: Path, seconds: float, store: ResultStore) -> R
         raise usage(
             f"there is no network `{path}`", "git clone https://github.com/JuliaReach/ARCH2023_AINNCS_RE"
         )
-    task = load_task(File.SYSTEMS / "ainncs" / f"{case.spec}.stl")
+    task = Task.load(File.SYSTEMS / "ainncs" / f"{case.spec}.stl")
     values = {**inputs_of(task), "network": sha256(path.read_bytes()), "seconds": seconds}
 
     def compute() -> Result:

@@ -27,7 +27,7 @@ from stlc.assurance.drives import PolicyDrives
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
 from stlc.controller.deployment.batched import Setting
-from stlc.controller.evaluation.rules import rules_of
+from stlc.controller.evaluation.rules import Rules
 from stlc.controller.run.run import Run
 from stlc.registry import GUARDS
 from stlc.rundir import RunDir
@@ -183,5 +183,5 @@ def _drives_of(folder: RunDir, drives: int, steps: int | None, store: ResultStor
 
 
 def _recorded(run: Run, setting: Setting, seeds: Sequence[int]) -> Sample:
-    drives = PolicyDrives(run, rules_of(run), GUARDS.default, replace(setting, seeds=()))
+    drives = PolicyDrives(run, Rules.of(run), GUARDS.default, replace(setting, seeds=()))
     return joined([*drives.observed(seeds)])

@@ -204,7 +204,7 @@ def _policy(name: str, options: CertifyOptions) -> PolicyDrives:
     """Drives of the policy of a run."""
     from stlc.assurance.drives import PolicyDrives
     from stlc.controller.deployment.batched import Setting
-    from stlc.controller.evaluation.rules import rules_of
+    from stlc.controller.evaluation.rules import Rules
     from stlc.controller.guard.margins import parse_margins
     from stlc.controller.run.run import Run
 
@@ -214,7 +214,7 @@ def _policy(name: str, options: CertifyOptions) -> PolicyDrives:
     setting = Setting((), options.agents or test.agents, options.steps or test.steps, test.replan)
     margin = parse_margins(options.margin).of(opened.task, opened.policy, mode, test.replan)
     setting = replace(setting.limited(options.time_limit), margin=margin)
-    rules, require = rules_of(opened), tuple(options.require)
+    rules, require = Rules.of(opened), tuple(options.require)
     return PolicyDrives(opened, rules, mode, setting, require, options.overrides)
 
 

@@ -250,10 +250,9 @@ def plant_inputs(spec: ast.Spec, decl: PlantDecl) -> dict[str, str]:
 
 def system_inputs(spec: ast.Spec, system: Path, overrides: Mapping[str, str]) -> dict[str, str]:
     """Hashes of what the simulations of a system depend on: as `plant_inputs`."""
-    from stlc.dynamics.functions import function_files
     from stlc.dynamics.load import load_system_decl
 
-    files = function_files(load_system_decl(system, overrides))
+    files = load_system_decl(system, overrides).files
     hashes = {f"file {name}": _file_hash(path) for name, path in sorted(files.items())}
     return {"spec": _spec_hash(spec), "system": sha256(File(system).read().text), **hashes}
 

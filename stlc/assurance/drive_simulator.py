@@ -16,7 +16,7 @@ from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, 
 from stlc.controller.deployment.simulator import simulate as run_worlds
 from stlc.controller.deployment.tape import BELOW
 from stlc.controller.evaluation.archive import trace_of
-from stlc.controller.evaluation.rules import Rules, rules_of, verdict_on_runs
+from stlc.controller.evaluation.rules import Rules
 from stlc.controller.guard.guard import Guard
 from stlc.controller.run.run import Run
 from stlc.controller.world import world_type
@@ -86,7 +86,7 @@ class DriveSimulator(Simulator):
     @cached_property
     def _rules(self) -> Rules:
         """Specification by which drives are judged: that of the section `test`, or else that of the plans."""
-        found = rules_of(self.run)
+        found = Rules.of(self.run)
         compiled = self.run.task.compiled
         return found or Rules(compiled.spec, compiled.name, self.run.task.system.decl.overrides)
 
@@ -140,7 +140,7 @@ class DriveSimulator(Simulator):
 
     def judge(self, recording: DeploymentRecording) -> JudgedDrives:
         """Judge recorded drives by the specification of drives, or else by that of the plans."""
-        return JudgedDrives(verdict_on_runs(self._rules, self.run.task, recording), self.setting.agents)
+        return JudgedDrives(self._rules.verdict_on(self.run.task, recording), self.setting.agents)
 
     def trace(self, points: NDArray[np.float64]) -> Trace:
         """Drives at `points`, (count, dim), as a trace with one row per agent."""

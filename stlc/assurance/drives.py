@@ -24,14 +24,13 @@ from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import Setting
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Watch, simulate
 from stlc.controller.evaluation.executed import executed_robustness
-from stlc.controller.evaluation.rules import Rules, rules_for, verdict_on_runs
+from stlc.controller.evaluation.rules import Rules
 from stlc.controller.guard.guard import Guard
 from stlc.controller.problem.task import Task
 from stlc.controller.run.checkpoint import FOLDER, POINTER, CheckpointHead
 from stlc.controller.run.run import CONFIG, Run
 from stlc.controller.world import independent_agents, world_type
 from stlc.dynamics.declaration.decl import SystemDecl
-from stlc.dynamics.functions import function_files
 from stlc.jsontext import plain
 from stlc.monitor.judgement import chosen
 from stlc.provenance import sha256
@@ -77,7 +76,7 @@ def sample_of(
         inside = in_scope(task, dict(zip(task.system.names, states, strict=True)))
         weights: Mapping[str, float] = {rule.name: rule.factor for rule in task.rules}
     else:
-        verdict = verdict_on_runs(rules, task, recording)
+        verdict = rules.verdict_on(task, recording)
         judged, weights = tuple(map(Judged.by, verdict)), verdict.factors
         inside = np.broadcast_to(verdict.scope, (rows,))
     counted = chosen(judged, require)
@@ -173,7 +172,7 @@ def inputs_of(folder: RunDir, decl: SystemDecl, rules: Rules | None, guard: str)
     Raises:
         UsageError: U101, there is no guard called `guard`.
     """
-    files = sorted(function_files(decl).items())
+    files = sorted(decl.files.items())
     judge = "" if rules is None else spec_sha256(rules.spec.source.text, rules.spec.library or {})
     changes = [] if rules is None else sorted(rules.overrides.items())
     return CertifiedInputs(
@@ -199,7 +198,7 @@ def verify(stored: StoredCertificate, folder: RunDir) -> CertificateVerification
     """
     conditions = stored.conditions
     decl = Run.declaration_in(folder, conditions.overrides, conditions.scenario)
-    present: Any = plain(inputs_of(folder, decl, rules_for(folder, decl), conditions.guard))
+    present: Any = plain(inputs_of(folder, decl, Rules.stored(folder, decl), conditions.guard))
     return compared(stored, present)
 
 

@@ -21,7 +21,6 @@ from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import nodes
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.kernel import Adjoint, ObjectiveSlopes
-from stlc.controller.problem.load import load_task
 from stlc.controller.problem.native import NativeGradient, NativeJudge
 from stlc.controller.problem.task import Task
 from stlc.controller.search.plan_traces import trace_of
@@ -64,7 +63,7 @@ class ModelSimulator:
             UsageError: U101, the system has controls, so that it needs a controller.
             SpecError, SystemFileError: a file is invalid.
         """
-        task = load_task(spec, system, overrides)
+        task = Task.load(spec, system, overrides)
         decl = task.system.decl
         if decl.controls:
             listed = ", ".join(f"`{control.name}`" for control in decl.controls)
@@ -74,7 +73,7 @@ class ModelSimulator:
 
         @cache
         def finer(sampled: bool) -> Task:
-            return load_task(spec, system, {**overrides, **_halved(decl, sampled=sampled)})
+            return Task.load(spec, system, {**overrides, **_halved(decl, sampled=sampled)})
 
         return cls(task, None if decl.discrete else lambda counts: finer(digital or counts))
 

@@ -21,11 +21,10 @@ from stlc.controller.evaluation.deployment import (
     InterruptedDeploymentError,
     deploy,
 )
-from stlc.controller.evaluation.rules import JudgedRuns, Rules, rules_of
+from stlc.controller.evaluation.rules import JudgedRuns, Rules
 from stlc.controller.guard.kind import named_guard
 from stlc.controller.guard.margins import MarginRequest, parse_margins
 from stlc.controller.policies.policy import Policy
-from stlc.controller.problem.load import load_task, require_controls
 from stlc.controller.problem.task import Task
 from stlc.controller.run.run import Run
 from stlc.controller.search.planner_policy import PlannerChoice, planner_policy
@@ -177,7 +176,7 @@ def simulation(
     if isinstance(subject, str | Path):
         spec = Path(subject)
         if planner is not None and (spec.suffix == ".stl" or spec.is_file()):
-            task = load_task(str(subject), options.system, options.overrides, whole=True)
+            task = Task.load(str(subject), options.system, options.overrides, whole=True)
             launch = Launch(root=options.runs, overrides=options.overrides, command=sys.argv[1:])
             subject = open_planner(task, planner, seed=0, launch=launch).path
         else:
@@ -188,7 +187,7 @@ def simulation(
     if beside is not None and options.system is not None:
         raise usage("`--system` is for a specification, and a run has its own")
     if GUARDS.get(guard).intervenes:
-        require_controls(run.task, "a guard")
+        run.task.require_controls("a guard")
     test = run.task.system.decl.test
     size = options.agents or test.agents, options.steps or test.steps
     if (finding := _longer(run, size[1])) is not None:
@@ -276,7 +275,7 @@ class _Order:
         run = self.run
         if scenario is not None:
             run = Run.open(run.dir.path, overrides=self.options.overrides, scenario=scenario)
-        rules, name = rules_of(run), run.task.compiled.name
+        rules, name = Rules.of(run), run.task.compiled.name
         margin = self.margins.of(run.task, run.policy, self.guard, self.setting.replan)
         each = replace(self, run=run, setting=replace(self.setting, margin=margin))
         found, planners = {}, {}

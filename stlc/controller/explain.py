@@ -11,7 +11,7 @@ from stlc.files import File
 from stlc.grammar import ast
 from stlc.grammar.manual import CodeList, Page, SpecInWords, in_words, read_page
 from stlc.registry import did_you_mean
-from stlc.rundir import RunDir, recorded_trace
+from stlc.rundir import RunDir
 
 if TYPE_CHECKING:
     from stlc.controller.guard.coverage import Guarantee
@@ -80,6 +80,6 @@ def explain(
     from stlc.monitor.check import Question, judge
     from stlc.monitor.explain.tree import explanation
 
-    path = File(name if File(name).is_pattern else str(recorded_trace(name, runs))).seen(runs)
+    path = File(name if File(name).is_pattern else str(RunDir.recorded_trace(name, runs))).seen(runs)
     verdicts = judge(path, Question(require=require, **options))
     return explanation(next((each for each in verdicts if each.causes), verdicts[0]))  # the first violation

@@ -6,7 +6,6 @@ import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from pathlib import Path
 from typing import Any, final
 
 import numpy as np
@@ -16,7 +15,6 @@ from stlc.compile.namespace import Array
 from stlc.diagnostics import SystemFileError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.functions import FunctionDecl
-from stlc.dynamics.declaration.init import FileDecl
 from stlc.foreign import module_at, require_driving
 from stlc.registry import did_you_mean
 
@@ -32,24 +30,6 @@ def load_functions(decl: SystemDecl) -> Mapping[str, InterfaceFunction]:
         function.name: function if function.body is not None else PythonFunction(function, _loaded(function))
         for function in decl.functions
     }
-
-
-def function_files(decl: SystemDecl) -> dict[str, Path]:
-    """Return the files that a system file refers to: name -> path.
-
-    These are the files that the system file extends, the files of its functions, and files of initial states.
-    If a file is below the folder of the system file, its name is its path relative to this folder. Otherwise
-    its name is its file name.
-    """
-    home = decl.path.parent.resolve()
-    named = [Path(base.name) for base in decl.bases]
-    named += [function.module for function in decl.functions if isinstance(function.module, Path)]
-    named += [part.points.path for part in decl.init.mixture if isinstance(part.points, FileDecl)]
-    found: dict[str, Path] = {}
-    for path in (each.resolve() for each in named if each.is_file()):
-        below = path.is_relative_to(home)
-        found[path.relative_to(home).as_posix() if below else path.name] = path
-    return found
 
 
 def _loaded(decl: FunctionDecl) -> Callable[..., Array]:

@@ -17,7 +17,6 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.controller.problem.environments import MOST, Environments, require_reward, reward_at_end
-from stlc.controller.problem.load import load_task, require_controls
 from stlc.controller.problem.task import Task
 from stlc.controller.world import ModelWorld, world_type
 from stlc.diagnostics import usage
@@ -284,8 +283,8 @@ def make(
         SpecError, SystemFileError: a file is invalid, or the specification and the system do not fit
             together.
     """
-    task = load_task(spec, system, hint="give `system`")
-    require_controls(task)
+    task = Task.load(spec, system, hint="give `system`")
+    task.require_controls()
     return SpecEnv(
         task,
         steps=steps,

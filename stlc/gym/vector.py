@@ -14,7 +14,6 @@ from torch import Tensor
 
 from stlc.controller.problem.environments import MOST, Environments, Transition
 from stlc.controller.problem.environments import Reward as EpisodeReward
-from stlc.controller.problem.load import load_task, require_controls
 from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.controller.world import ModelWorld
 from stlc.diagnostics import usage
@@ -234,8 +233,8 @@ def make_vec(
         SpecError, SystemFileError: a file is invalid, or the specification and the system do not fit
             together.
     """
-    task = load_task(spec, system, hint="give `system`")
-    require_controls(task)
+    task = Task.load(spec, system, hint="give `system`")
+    task.require_controls()
     return SpecVectorEnv(
         task,
         num_envs,

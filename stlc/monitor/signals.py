@@ -33,7 +33,7 @@ from stlc.registry import closest, did_you_mean
 from stlc.signature import Column, Kind
 from stlc.source import Span
 from stlc.trace import AS_IT_IS, Reading, Trace
-from stlc.trace.enums import TRUTH, Words
+from stlc.trace.enums import Words
 from stlc.trace.formats.table import GROUPS
 from stlc.trace.recording import Conversion, conversion
 from stlc.trace.resample import Between, How, Moments, TimeRange
@@ -112,7 +112,7 @@ def reading_of(spec: ast.Spec, requested: Reading = AS_IT_IS, read: Collection[s
         base, bracket, index = name.partition("[")
         return columns.get(name) or f"{columns.get(base, base)}{bracket}{index}"
 
-    worth: dict[str, Words] = {"bool": TRUTH}
+    worth: dict[str, Words] = {"bool": Column.TRUTH}
     worth |= {item.name: dict(item.members) for item in spec.items if isinstance(item, ast.Enum)}
     kinds: dict[str, Kind] = {}
     words: dict[str, Words] = {}

@@ -16,22 +16,10 @@ from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.registry import did_you_mean
-from stlc.signature import Column
 from stlc.trace.formats.cells import value_of
 from stlc.trace.recording import ClockGroup, Recording
 
 Words = Mapping[str, float]
-
-TRUTH: Words = {
-    **dict.fromkeys(("true", "yes", "on"), 1.0),
-    **dict.fromkeys(("false", "no", "off"), 0.0),
-}
-"""Words for truth values, in any case."""
-
-
-def words_of(column: Column) -> Words:
-    """Words for the values of a column: the labels of an enum, or those for truth values; else none."""
-    return TRUTH if column.kind == "bool" else dict(column.labels)
 
 
 def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.registry import did_you_mean
-from stlc.signature import MAX_COMPONENTS, Column
+from stlc.signature import Column
 from stlc.source import Span
 from stlc.trace.meta import TraceMeta
 from stlc.units import Unit
@@ -245,13 +245,17 @@ def fit(name: str, arrays: Mapping[str, Array], samples: int) -> dict[str, Array
             data[signal] = np.atleast_2d(values)
         elif not values.ndim:
             data[signal] = np.broadcast_to(values, (1, samples))
-        elif values.ndim in (2, 3) and values.shape[-2] == samples and values.shape[-1] <= MAX_COMPONENTS:
+        elif (
+            values.ndim in (2, 3)
+            and values.shape[-2] == samples
+            and values.shape[-1] <= Column.MAX_COMPONENTS
+        ):
             stacked = values[None] if values.ndim == 2 else values
             data |= {f"{signal}[{i}]": stacked[..., i] for i in range(values.shape[-1])}
         else:
             shape = " x ".join(map(str, values.shape)) or "a single number"
             message = f"`{signal}` in `{name}` is {shape}, and `t` has {samples} samples"
-            most = f"(samples, components up to {MAX_COMPONENTS})"
+            most = f"(samples, components up to {Column.MAX_COMPONENTS})"
             help_ = (f"signals are (samples,), (traces, samples) or {most}",)
             findings.append(Diagnostic("E605", message, help=help_))
     traces = max((len(values) for values in data.values()), default=0)

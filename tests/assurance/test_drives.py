@@ -18,7 +18,7 @@ from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import Setting
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, simulate
 from stlc.controller.evaluation.executed import judge_executed
-from stlc.controller.evaluation.rules import Rules, rules_of
+from stlc.controller.evaluation.rules import Rules
 from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import BestOfKPolicy
 from stlc.controller.problem.task import Task
@@ -66,7 +66,7 @@ def test_drives_are_judged_as_deployments_are(run: Run) -> None:
         assert ((each.robustness >= -TOLERANCE) == held).all()
     assert not found.overall.satisfied.all()
     assert found.units.tolist() == list(range(12))
-    by_rules = sample_of(run.task, recording, rules_of(run))
+    by_rules = sample_of(run.task, recording, Rules.of(run))
     assert {each.name for each in by_rules.requirements} != {each.name for each in found.requirements}
 
 
@@ -127,7 +127,7 @@ def test_drives_that_violate_an_assumption_are_left_out(tmp_path: Path) -> None:
 
 
 def test_a_campaign_is_repeatable_and_counts_its_seeds(run: Run) -> None:
-    drives = PolicyDrives(run, rules_of(run), "none", Setting((), 4, 2, 1))
+    drives = PolicyDrives(run, Rules.of(run), "none", Setting((), 4, 2, 1))
     order = Campaign(drives, Claim(0.999), most=FIRST + 20)
     first, again = list(campaign(order)), next(campaign(order))
     assert plain(first[0].assessment) == plain(again.assessment)

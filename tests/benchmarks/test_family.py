@@ -26,7 +26,7 @@ from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.loop import train
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
-from stlc.rundir import every_run
+from stlc.rundir import RunDir
 from stlc.source import Source
 
 ROOT = Path(__file__).parents[2]
@@ -112,7 +112,7 @@ def test_from_training_to_the_page_and_again(
     assert second["rows"][1] == first["rows"][0]
 
     (folder,) = (tmp_path / "runs").iterdir()
-    (run,) = every_run(folder)
+    (run,) = RunDir.every(folder)
     policy = Run.open(run.path, overrides={"radius": "1.0m"}).policy
     states = policy.task.sample(20, seed=HELD_OUT_SEED, dtype=torch.float64)
     assert set(states[:, policy.task.system.names.index("radius")].tolist()) == {1.0}

@@ -49,7 +49,7 @@ from stlc.controller.run.run import Run
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.loop import Watch, train
 from stlc.registry import METHODS
-from stlc.rundir import every_run
+from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[2]
 QUICK = {"train.batch": "8"}
@@ -206,7 +206,7 @@ def test_a_longer_training_extends_a_shorter_one(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr("stlc.controller.parallel.jobs.LocalExecutor.run", train_here)
     (result,) = filled([long], place).results
     assert sent[0].arguments[0] == "--resume"
-    (longer,) = every_run(place.runs_of(long.key))
+    (longer,) = RunDir.every(place.runs_of(long.key))
     assert longer.name == run.dir.name
     assert [row["step"] for row in longer.rows()][: len(run.dir.rows())] == [
         row["step"] for row in run.dir.rows()
@@ -251,7 +251,7 @@ def test_a_run_that_was_cut_short_goes_on(tmp_path: Path) -> None:
     broken = quick(seed=1, overrides={"train.lr": "1e30"}, length=Length(steps=9))
     found = {each.name: (result, why) for each, result, why in _fill([cell, broken], replace(place, jobs=2))}
     assert (found[cell.name][0] or {})["steps"] == 6
-    assert [run.path for run in every_run(place.runs_of(cell.key))] == [cut.dir.path]
+    assert [run.path for run in RunDir.every(place.runs_of(cell.key))] == [cut.dir.path]
     assert cut.dir.status == "finished"
     assert found[broken.name][0] is None
     assert found[broken.name][1]

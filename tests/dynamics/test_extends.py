@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from stlc.diagnostics import StlcError
-from stlc.dynamics.functions import function_files
 from stlc.dynamics.load import load_system_decl
 
 BASE = """\
@@ -54,7 +53,7 @@ def test_a_run_keeps_the_files_beside_each_other(folder: Path, tmp_path: Path) -
     run = tmp_path / "run"
     run.mkdir()
     (run / "system.yaml").write_text(decl.source.text)
-    for name, path in function_files(decl).items():
+    for name, path in decl.files.items():
         (run / name).write_bytes(path.read_bytes())
     (folder / "cart.yaml").unlink()
     assert load_system_decl(run / "system.yaml").hash == decl.hash

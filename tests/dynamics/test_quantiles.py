@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from stlc.controller.problem.load import load_task
+from stlc.controller.problem.task import Task
 from stlc.dynamics.quantiles import InitialPoints
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.mark.parametrize("name", ["traffic", "ship_track", "navigation"])
 def test_uniform_points_give_the_declared_distribution(name):
-    system = load_task(ROOT / "specs" / f"{name}.stl").system
+    system = Task.load(ROOT / "specs" / f"{name}.stl").system
     points = InitialPoints(system)
     generator = torch.Generator().manual_seed(1)
     states = points.states(torch.rand((20_000, points.dim), generator=generator, dtype=torch.float64))
@@ -26,7 +26,7 @@ def test_uniform_points_give_the_declared_distribution(name):
 
 
 def test_the_same_point_gives_the_same_state():
-    points = InitialPoints(load_task(ROOT / "specs/traffic.stl").system)
+    points = InitialPoints(Task.load(ROOT / "specs/traffic.stl").system)
     at = torch.rand((50, points.dim), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     together = points.states(at)
     alone = torch.cat([points.states(each[None]) for each in at])
@@ -40,7 +40,7 @@ def test_coordinates_of_columns(tmp_path):
         "init: {mixture: [{draw: {x: 'uniform(0, 1)', y: 'x + uniform(0, 1)'}}]}\n"
     )
     (tmp_path / "s.stl").write_text('system "s.yaml"\nsignal x\nrequire r: always x < 2\n')
-    points = InitialPoints(load_task(tmp_path / "s.stl").system)
+    points = InitialPoints(Task.load(tmp_path / "s.stl").system)
     assert points.dim == 2
     assert points.coordinates_of(("x", "y")) == {"x": 0}
     assert points.last_coordinates_of(("x", "y")) == (0, 1)

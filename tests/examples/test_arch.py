@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
 import stlc
-from stlc.controller.problem.load import load_task
 from stlc.controller.problem.task import Task
 from stlc.dynamics.declaration.inputs import signal_values
 from stlc.dynamics.system import System
@@ -309,7 +308,7 @@ AEROBENCH = {
 
 def test_f16() -> None:
     """Two trajectories, and the least altitudes in ft, are those of AeroBenchVVPython with its own RK45."""
-    task = load_task(ROOT / "specs/arch/f16.stl")
+    task = Task.load(ROOT / "specs/arch/f16.stl")
     names, const = task.system.names, partial(constant, task.system)
     x0 = task.sample(4, seed=0, dtype=torch.float64)
     shares = {"roll": [1.0, 0.0, 0.95, 1.0], "pitch": [0.0, 1.0, 0.0, 0.01], "yaw": [0.5, 0.0, 0.5, 0.5]}
@@ -330,7 +329,7 @@ def judged(
     spec: str, inputs: list[tuple[float | tuple[float, ...], ...]]
 ) -> tuple[dict[str, list[float]], dict[str, torch.Tensor]]:
     """Robustness by requirement, and states, under input signals: a constant, or a value for each piece."""
-    task = load_task(ROOT / f"specs/arch/{spec}.stl")
+    task = Task.load(ROOT / f"specs/arch/{spec}.stl")
     names = task.system.names
     x0 = task.sample(len(inputs), seed=0, dtype=torch.float64)
     for decl, values in zip(task.system.decl.inputs, zip(*inputs, strict=True), strict=True):

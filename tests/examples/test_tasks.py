@@ -22,7 +22,7 @@ from stlc.files import File
 from stlc.grammar.parser import parse
 from stlc.lint.lint import lint
 from stlc.monitor.verdict import Monitor
-from stlc.rundir import every_run
+from stlc.rundir import RunDir
 
 ROOT = Path(__file__).resolve().parents[2]
 TASKS = ROOT / "examples" / "tasks"
@@ -80,7 +80,7 @@ def test_a_minute_of_training_satisfies_the_task(
     words = ["train", str(TASKS / f"{name}.stl"), *budget, "--no-pictures", "--runs", str(tmp_path)]
     assert main([*words, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)["result"]["closed_loop"]
-    (run,) = every_run(tmp_path)
+    (run,) = RunDir.every(tmp_path)
     assert told["recommended"] is not None, told
     satisfied, drives = load_tool("fresh_drives").fresh_drives(
         Run.open(run.path), told["recommended"], DRIVES

@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from stlc.diagnostics import StlcError, TraceError, UsageError
-from stlc.signature import Column, Signature
+from stlc.signature import TRUTH, Column, Signature
 from stlc.trace import Reading, Trace, TraceMeta, as_fraction
-from stlc.trace.enums import TRUTH
 from stlc.trace.formats import csv as trace_csv
 from stlc.trace.formats.npz import read as read_npz
 from stlc.units import Unit

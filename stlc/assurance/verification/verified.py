@@ -162,9 +162,9 @@ class _LoopSource:
         """Load the closed loop."""
         from stlc.assurance.verification.loop import NetworkLoop
         from stlc.assurance.verification.onnx_layers import read_onnx
-        from stlc.controller.problem.load import load_task
+        from stlc.controller.problem.task import Task
 
-        period, task = self.options.period, load_task(self.spec, self.options.system)
+        period, task = self.options.period, Task.load(self.spec, self.options.system)
         dt = float(task.system.decl.dt)
         steps = 1.0 if period is None else period / dt
         if steps < 0.5 or abs(steps - round(steps)) > 1e-6:

@@ -88,7 +88,7 @@ def plan(
     """
     from stlc.assurance.verification.planned import PlanTubes
     from stlc.assurance.verification.tubes import TubeModel
-    from stlc.controller.problem.load import load_task
+    from stlc.controller.problem.task import Task
     from stlc.controller.search.plan_traces import following, starts_of, trace_of
     from stlc.controller.search.planner import PlanBudget, PlanSearch, planner_named, prepared
     from stlc.controller.search.planner_policy import PlannerChoice
@@ -100,7 +100,7 @@ def plan(
     choice = PlannerChoice(method, option, budget)
     judged = None if evaluations is None else parse_count(evaluations, "--evaluations")
     planner = planner_named(method, **option)
-    task = load_task(spec, system, set_, scenario=tube, whole=True)
+    task = Task.load(spec, system, set_, scenario=tube, whole=True)
     show_diagnostics(task.compiled.warnings)
     model = None if tube is None else TubeModel(task)
     states = starts_of(task, from_, starts, seed)

@@ -57,12 +57,12 @@ def plot(
     requirements, such as `dock` in `[x, y] in dock`. The suffix of -o selects the format: .svg, .png or .pdf.
     """
     from stlc.monitor.check import load
-    from stlc.rundir import recorded_trace
+    from stlc.rundir import RunDir
     from stlc.view import require_drawing
     from stlc.view.plotted import plotted_places, plotted_signals, save_picture
 
     require_drawing()
-    path = recorded_trace(what, reading.runs)
+    path = RunDir.recorded_trace(what, reading.runs)
     target = _target(output, path)
     require_separate([("--out", target)], (path, reading.spec, reading.system))
     question = reading.question(require=())

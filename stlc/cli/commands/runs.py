@@ -18,7 +18,7 @@ from stlc.cli.framework.program import group, subcommand
 from stlc.diagnostics import StlcError, usage
 from stlc.escape import visible
 from stlc.options import Options
-from stlc.rundir import RunDir, every_run, remove_run
+from stlc.rundir import RunDir
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ def list_(
     runs: Options.Runs = RunDir.RUNS,
 ) -> Answer[RunList]:
     """List all runs."""
-    found = [(run, *_record(run)) for run in every_run(runs)]
+    found = [(run, *_record(run)) for run in RunDir.every(runs)]
     if sort == "acc":
         found.sort(key=lambda each: -1.0 if (share := _accuracy(each[1])) is None else share)
     if sort == "time":
@@ -170,7 +170,7 @@ def rm(
         advice = ("stop it first, or remove it with --force",)
         raise usage(f"{', '.join(going)} is still going", *advice)
     for folder in folders:
-        remove_run(folder)
+        folder.remove()
     removed = [folder.shown for folder in folders]
 
     def tell() -> None:

@@ -21,10 +21,10 @@ def run_names(context: typer.Context, incomplete: str) -> list[str]:
 
     Proposed are `latest`, the names of all runs (newest first), and the names of their specifications.
     """
-    from stlc.rundir import RunDir, every_run
+    from stlc.rundir import RunDir
 
     root = Path(str(context.params.get("runs") or "runs"))
-    runs = [run.path for run in every_run(root)][::-1]
+    runs = [run.path for run in RunDir.every(root)][::-1]
     names = (
         [RunDir.LATEST, *(path.name for path in runs), *(path.parent.name for path in runs)] if runs else []
     )

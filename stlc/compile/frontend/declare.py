@@ -30,7 +30,7 @@ from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
 from stlc.grammar.words import BUILT_IN
 from stlc.registry import closest, did_you_mean
-from stlc.signature import MAX_COMPONENTS, Column, Kind, Role
+from stlc.signature import Column, Kind, Role
 from stlc.source import Span
 from stlc.units import Unit, nearest
 
@@ -117,8 +117,8 @@ def _check_extern_type(written: ast.TypeRef, scope: Scope) -> None:
         message = f"`{written.name}` cannot pass to or from a function outside"
         help_ = ("types: real, int, bool, and vectors `real[3]`",)
         scope.fail(Diagnostic("E101", message, written.span, help=help_))
-    if written.size is not None and not 1 <= written.size <= MAX_COMPONENTS:
-        message = f"a vector has between 1 and {MAX_COMPONENTS} components"
+    if written.size is not None and not 1 <= written.size <= Column.MAX_COMPONENTS:
+        message = f"a vector has between 1 and {Column.MAX_COMPONENTS} components"
         scope.fail(Diagnostic("E005", message, written.span))
 
 
@@ -176,8 +176,8 @@ def check_type(type_: ast.TypeRef | None, enums: Mapping[str, Labels], scope: Sc
     if type_.name not in _KINDS and type_.name not in enums and type_.name != "formula":
         help_ = did_you_mean(type_.name, (*_KINDS, *enums), "types: real, int, bool, or an enum")
         scope.fail(Diagnostic("E101", f"unknown type `{type_.name}`", type_.span, help=help_))
-    if type_.size is not None and not 1 <= type_.size <= MAX_COMPONENTS:
-        message = f"a vector has between 1 and {MAX_COMPONENTS} components"
+    if type_.size is not None and not 1 <= type_.size <= Column.MAX_COMPONENTS:
+        message = f"a vector has between 1 and {Column.MAX_COMPONENTS} components"
         scope.fail(Diagnostic("E005", message, type_.span))
 
 

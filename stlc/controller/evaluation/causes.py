@@ -16,7 +16,7 @@ import torch
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.evaluation.executed import model_consistent
 from stlc.controller.problem.task import Task
-from stlc.controller.search.feasibility import safety_task, solve
+from stlc.controller.search.feasibility import solve
 from stlc.native import Stop, never
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ def losses(
                 found[row] = Lost("rules", dt * last)
             continue
         at = np.unique(np.linspace(since, last, min(LOOKS, last - since + 1)).round().astype(int))
-        asked = safety_task(task) if unsafe and task.compiled.safety else task
+        asked = task.safety_task if unsafe and task.compiled.safety else task
         states = torch.from_numpy(recording.states[row, at])
         plans = solve(asked, states, passes=PASSES, tries=TRIES, stop=stop)
         solved = np.flatnonzero(plans.solved.numpy())

@@ -29,12 +29,7 @@ from stlc.controller.deployment.simulator import (
 from stlc.controller.evaluation.causes import Cause, losses
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.held_out import wilson
-from stlc.controller.evaluation.rules import (
-    Rules,
-    judge_runs_by_plans,
-    rules_of,
-    runs_by_rules,
-)
+from stlc.controller.evaluation.rules import Rules, judge_runs_by_plans, runs_by_rules
 from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.kind import compared_guards
@@ -254,7 +249,7 @@ def closed_loop(run: Run, left: Callable[[], float], most: int = DRIVES, *, extr
     steps, dt = system.decl.test.steps, system.dt
     nothing = ClosedLoop((), steps, steps * dt, system.horizon * dt)
     try:
-        rules = rules_of(run)
+        rules = Rules.of(run)
         trial = _Trial(run, rules, left, most, SEED, extra)
         trial.simulate()
     except StlcError as error:

@@ -69,6 +69,54 @@ class Rules:
         rules = (item for item in self.spec.items if isinstance(item, ast.Require))
         return {item.name: " ".join((item.doc or "").split()) for item in rules}
 
+    @staticmethod
+    def of(run: Run) -> Rules | None:
+        """Rules for the closed-loop runs of a run; None if the specification of the plans judges them.
+
+        Training copies the rules that the system file names into the run folder, and this copy is read. Rules
+        that are named later, with `--set test.judge=…`, are read from their own file.
+
+        Raises:
+            RunError: R101, the index of the copies in the run folder is damaged.
+            SystemFileError: S210, the file of rules does not exist.
+            SpecError: the file is not a specification.
+        """
+        return Rules.stored(run.dir, run.task.system.decl)
+
+    @staticmethod
+    def stored(folder: RunDir, decl: SystemDecl) -> Rules | None:
+        """Rules for the closed-loop runs of the run in a folder, whose system is `decl`; see `of`."""
+        judge, overrides = decl.test.judge, decl.overrides
+        if judge is None:
+            return None
+        index = folder.read_json(_INDEX, dict[str, CopiedRules]) if folder.has(_INDEX) else {}
+        entry = index.get(judge.written)
+        if entry is None:
+            spec = read_rules(judge)
+            return Rules(spec, str(judge.path), _own(spec, overrides))
+        name = entry["file"]
+        spec = parse(folder.source(f"{JUDGE}/{name}"))
+        spec = replace(spec, library=folder.library(_library_of(name)))
+        return Rules(spec, entry.get("path") or name, _own(spec, overrides))
+
+    def verdict_on(self, task: Task, recording: DeploymentRecording) -> Verdict:
+        """Verdict of the rules on every run from its first sample to its last.
+
+        Raises:
+            SpecError: the rules use names that the system does not have.
+        """
+        outside = any(isinstance(item, ast.Extern) for item in self.spec.items)
+        decl = task.system.decl
+        monitor = Monitor(
+            self.spec,
+            dt=decl.dt,
+            horizon=decl.dt * decl.horizon,
+            system=decl.path if outside else None,
+            overrides=self.overrides,
+        )
+        columns = np.moveaxis(recording.states, -1, 0)
+        return monitor.check(dict(zip(task.system.names, columns, strict=True)))
+
 
 @dataclass(frozen=True, slots=True)
 class Broken:
@@ -185,36 +233,6 @@ def keep_rules(folder: RunDir, task: Task) -> None:
     folder.write_json(_INDEX, index)
 
 
-def rules_of(run: Run) -> Rules | None:
-    """Rules for the closed-loop runs of a trained run; None if the specification of the plans judges them.
-
-    Training copies the rules that the system file names into the run folder, and this copy is read. Rules
-    that are named later, with `--set test.judge=…`, are read from their own file.
-
-    Raises:
-        RunError: R101, the index of the copies in the run folder is damaged.
-        SystemFileError: S210, the file of rules does not exist.
-        SpecError: the file is not a specification.
-    """
-    return rules_for(run.dir, run.task.system.decl)
-
-
-def rules_for(folder: RunDir, decl: SystemDecl) -> Rules | None:
-    """Rules for the closed-loop runs of the run in a folder, whose system is `decl`; see `rules_of`."""
-    judge, overrides = decl.test.judge, decl.overrides
-    if judge is None:
-        return None
-    index = folder.read_json(_INDEX, dict[str, CopiedRules]) if folder.has(_INDEX) else {}
-    entry = index.get(judge.written)
-    if entry is None:
-        spec = read_rules(judge)
-        return Rules(spec, str(judge.path), _own(spec, overrides))
-    name = entry["file"]
-    spec = parse(folder.source(f"{JUDGE}/{name}"))
-    spec = replace(spec, library=folder.library(_library_of(name)))
-    return Rules(spec, entry.get("path") or name, _own(spec, overrides))
-
-
 def _library_of(name: str) -> str:
     return f"{JUDGE}/lib/{file_of(name)}"
 
@@ -252,30 +270,11 @@ def judge_runs(
 
 def runs_by_rules(rules: Rules, task: Task, recording: DeploymentRecording) -> RunVerdicts:
     """Judge every closed-loop run as `judge_runs` does, but do not search for plans: all runs are viable."""
-    verdict = verdict_on_runs(rules, task, recording)
+    verdict = rules.verdict_on(task, recording)
     found = {judgement.name: np.array(judgement.statuses) for judgement in verdict}
     safety = frozenset(rule.name for rule in verdict.subject.compiled.safety)
     kept = tuple(name for name in found if name in safety)
     return RunVerdicts(found, tuple(_broken(verdict, found)), np.ones(verdict.traces, dtype=bool), kept)
-
-
-def verdict_on_runs(rules: Rules, task: Task, recording: DeploymentRecording) -> Verdict:
-    """Evaluate the rules on every run from its first sample to its last.
-
-    Raises:
-        SpecError: the rules use names that the system does not have.
-    """
-    outside = any(isinstance(item, ast.Extern) for item in rules.spec.items)
-    decl = task.system.decl
-    monitor = Monitor(
-        rules.spec,
-        dt=decl.dt,
-        horizon=decl.dt * decl.horizon,
-        system=decl.path if outside else None,
-        overrides=rules.overrides,
-    )
-    columns = np.moveaxis(recording.states, -1, 0)
-    return monitor.check(dict(zip(task.system.names, columns, strict=True)))
 
 
 def judge_runs_by_plans(executed: Executed, dt: float) -> RunVerdicts:

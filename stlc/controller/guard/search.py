@@ -14,7 +14,6 @@ from stlc.controller.guard.candidates import REPAIRED, SAFEST, Candidates, Deadl
 from stlc.controller.guard.safe_prefix import robustness_until
 from stlc.controller.guard.stages import STAGES, Rejected, Setup
 from stlc.controller.search.ascent import SEED
-from stlc.controller.search.feasibility import safety_task
 from stlc.controller.search.local_search import Searcher
 
 if TYPE_CHECKING:
@@ -143,7 +142,7 @@ class RelaxedSearch(GuardSearch):
         self._strict = StagedSearch(strict, policy, guard, grid=grid, limits=half)
         self._plain = StagedSearch(task, policy, guard, grid=grid, limits=half)
         generator = torch.Generator().manual_seed(SEED)
-        self._searcher = Searcher(safety_task(strict), generator, target=0.0)
+        self._searcher = Searcher(strict.safety_task, generator, target=0.0)
         self._formulas = [rule.formula for rule in strict.compiled.safety]
 
     def _best(self, x: Tensor, plan: Tensor, previous: Tensor | None) -> Candidates:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from stlc.compile.frontend.modules import Module, load_modules
 from stlc.diagnostics import StlcError
-from stlc.dynamics.functions import function_files
 from stlc.dynamics.load import load_system_decl
 from stlc.files import File
 from stlc.grammar.parser import parse
@@ -35,7 +34,7 @@ def input_files(
             there = File(wanted).system(path)
             found[there] = None
             decl = load_system_decl(there, overrides or {})
-            found.update(dict.fromkeys(function_files(decl).values()))
+            found.update(dict.fromkeys(decl.files.values()))
             found.update(dict.fromkeys(world.path for world in decl.worlds))
             for judge in decl.judges:
                 found[judge.path] = None

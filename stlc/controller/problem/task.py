@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Self
 
 import torch
@@ -25,9 +26,13 @@ from stlc.compile.semantics.switch import Hard, Switch
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.native import NativeGradient, NativeJudge, motion_of, reason
 from stlc.controller.problem.pending_goals import PendingGoals
+from stlc.diagnostics import usage
 from stlc.dynamics.model.cost import PlanCost
+from stlc.dynamics.scenario import scenario_constants
 from stlc.dynamics.system import System, check_plans
+from stlc.files import File
 from stlc.grammar import ast
+from stlc.grammar.parser import parse
 from stlc.runtime.decision import rank
 from stlc.tabular import html_table
 
@@ -40,6 +45,8 @@ LONGEST = 500
 """Most steps of a plan that reaches beyond the horizon of the system, to the end of a mission."""
 MOST_VALUES = 32_000_000
 """Maximum number of values that torch holds while it judges plans: 256 MB in float64."""
+HINT = "--system FILE"
+"""Advice that most commands print if no system is named."""
 GUIDANCE = 0.1
 """Weight of the guidance cost towards the next goal among the performance terms."""
 GOALS = 3.0
@@ -131,6 +138,48 @@ class Task:
         return Task, (self.compiled, self.plain)
 
     @classmethod
+    def load(
+        cls,
+        spec: Path | str,
+        system: Path | str | None = None,
+        overrides: Mapping[str, str] | None = None,
+        *,
+        hint: str = HINT,
+        found: Callable[[Path], None] | None = None,
+        scenario: str | None = None,
+        whole: bool = False,
+    ) -> Task:
+        """Load a specification and a system, and compile the specification for the system.
+
+        Args:
+            spec: specification file, searched by `File.spec`.
+            system: system file, found by `File.system`; by default the one that the specification names.
+            overrides: constants of the specification and keys of the system file to change, name -> text.
+            hint: what the user may do if no system is named.
+            found: function that receives the path of the system file before it is read.
+            scenario: name of a scenario of the system file to apply.
+            whole: whether plans reach to the end of a deployment (`Task.of`).
+
+        Raises:
+            UsageError: U101, no system is named, or there is no such scenario; U102, there is no such file.
+            SpecError: the specification is invalid or does not fit the system.
+            SystemFileError: the system file is invalid.
+        """
+        path = File(spec).spec()
+        parsed = parse(File(path).read())
+        wanted = system if system is not None else parsed.system
+        if wanted is None:
+            raise usage(f"`{path}` names no system", hint, 'or a line `system "FILE"` in the specification')
+        there = File(wanted).system(path)
+        if found is not None:
+            found(there)
+        changed = dict(overrides or {})
+        if scenario is not None:
+            changed = {**scenario_constants(there, scenario, changed), **changed}
+        found_system = System.load(there, changed, scenario=scenario)
+        return cls.of(parsed, found_system, overrides=changed, whole=whole)
+
+    @classmethod
     def of(
         cls,
         spec: ast.Spec,
@@ -169,6 +218,23 @@ class Task:
         if values:
             compiled = replace(compiled, parameters=fixed(compiled.parameters, values))
         return cls(compiled, system)
+
+    @property
+    def safety_task(self) -> Task:
+        """A task with the requirements tagged `@safety` as its only specification."""
+        return Task(replace(self.compiled, requirements=self.compiled.safety), self.plain)
+
+    def require_controls(self, who: str = "a policy") -> None:
+        """Raise UsageError (U101) if the system has no control.
+
+        `who` names, in the message, what would choose the controls: `a policy` or `a guard`.
+        """
+        if self.system.decl.controls:
+            return
+        message = f"the system `{self.system.decl.name}` has no control: {who} has nothing to choose"
+        raise usage(
+            message, "`stlc plan SPEC` judges it from random initial states", "control: {u: {range: [-1, 1]}}"
+        )
 
     def __repr__(self) -> str:
         return f"Task({self.compiled.name} on {self.system.facts})"

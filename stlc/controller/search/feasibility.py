@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
@@ -91,9 +89,4 @@ def viable(task: Task, x0: Tensor) -> Tensor:
     """
     if not task.compiled.safety:
         return torch.ones(len(x0), dtype=torch.bool)
-    return solvable(safety_task(task), x0)
-
-
-def safety_task(task: Task) -> Task:
-    """The task with the requirements tagged `@safety` as its only specification."""
-    return Task(replace(task.compiled, requirements=task.compiled.safety), task.plain)
+    return solvable(task.safety_task, x0)

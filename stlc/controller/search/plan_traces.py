@@ -18,7 +18,6 @@ from stlc.diagnostics import UsageError, usage
 from stlc.grammar import ast
 from stlc.registry import did_you_mean
 from stlc.trace import Reading, Trace, TraceMeta
-from stlc.trace.enums import words_of
 from stlc.trace.recording import conversion
 from stlc.version import __version__
 
@@ -80,7 +79,7 @@ def _assignment(task: Task, part: str) -> tuple[str, float]:
         near, known = did_you_mean(name, task.system.names), f"states: {', '.join(task.system.names)}"
         raise usage(f"`{task.system.decl.name}` has no state `{name}`", "  ".join((*near, known)))
     column = task.system.signature[name]
-    words = words_of(column)
+    words = column.words
     word = value.lower() if column.kind == "bool" else value
     if word in words:
         return name, float(words[word])
@@ -113,7 +112,7 @@ def _recorded(task: Task, text: str, count: int | None, seed: int) -> Tensor:
         help_ = ("random", "x=1, v=2 m/s", "a trace, such as trace.npz")
         raise UsageError.of("U102", f"there is no file `{text}` with initial states", help=help_)
     columns = task.system.signature.columns
-    trace = Trace.load(text, Reading(words={column.name: words_of(column) for column in columns}))
+    trace = Trace.load(text, Reading(words={column.name: column.words for column in columns}))
     rows = min(trace.traces, count or trace.traces)
     states = task.sample(rows, seed=seed, dtype=torch.float64)
     missing = [name for name in task.plain.names if name not in trace.data]
@@ -129,7 +128,7 @@ def _recorded(task: Task, text: str, count: int | None, seed: int) -> Tensor:
         row, index = absent[0].tolist()
         raise usage(f"trace {row} of `{text}` has no first value of `{task.system.names[index]}`")
     for index, column in enumerate(columns):
-        if words := words_of(column):
+        if words := column.words:
             odd = (~torch.isin(states[:, index], torch.tensor(list(words.values())).double())).nonzero()
             if len(odd):
                 found = f"trace {int(odd[0])} of `{text}` begins with {float(states[odd[0], index]):g}"

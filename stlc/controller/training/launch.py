@@ -15,7 +15,6 @@ from stlc.controller.run.run import save_config, save_library
 from stlc.controller.search.planner import prepared
 from stlc.controller.search.planner_policy import PlannerChoice, planner_of
 from stlc.controller.training.config import ENGINE_VERSION, TrainConfig, resolve_config
-from stlc.dynamics.functions import function_files
 from stlc.provenance import git_state, hardware, sha256, versions
 from stlc.registry import METHODS, PLANNERS
 from stlc.rundir import RunDir, now, require_name
@@ -86,7 +85,7 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
     folder.write(RunDir.SYSTEM, decl.source.text)
     for path in {world.path for world in decl.worlds if world.path.is_file()}:
         folder.write(path.name, path.read_bytes())
-    for name, path in function_files(decl).items():
+    for name, path in decl.files.items():
         folder.write(name, path.read_bytes())
     keep_rules(folder, task)
     folder.write("compiled.txt", dump(task.compiled))

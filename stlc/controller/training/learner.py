@@ -26,7 +26,6 @@ from stlc.controller.problem.task import Task
 from stlc.controller.run.checkpoint import below
 from stlc.controller.run.config import ResolvedConfig
 from stlc.controller.run.run import load_weights
-from stlc.controller.search.feasibility import safety_task
 from stlc.controller.search.local_search import TAILS, THOROUGH, Search, Searcher, SearchResult, remainders
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.controller.training.adam import Adam
@@ -140,7 +139,7 @@ class Trainer(Learner):
         self.safety: Task | None = None
         if config.falsify:
             self.failures = FailureStates(torch.empty(0, len(task.system.names), device=device))
-            self.safety = safety_task(task) if task.compiled.safety else None
+            self.safety = task.safety_task if task.compiled.safety else None
 
     def advance(self) -> float:
         """Make one gradient step and return its loss.

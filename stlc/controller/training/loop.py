@@ -15,7 +15,6 @@ import torch
 
 from stlc.controller.evaluation.held_out import silent
 from stlc.controller.parallel.ddp import ALONE, Ranks, find_device
-from stlc.controller.problem.load import require_controls
 from stlc.controller.run.checkpoint import Checkpoint, load_checkpoint, never_saved, restoring
 from stlc.controller.run.config import ResolvedConfig
 from stlc.controller.run.run import Run, load_config
@@ -139,7 +138,7 @@ def prepare(
         MissingError: R302, the device does not exist; R403, the process of another rank has ended or does not
             answer; or a package that the method needs is missing.
     """
-    require_controls(task)
+    task.require_controls()
     now = clock_of(config.clock)
     started = now()
     keep_freed_memory()

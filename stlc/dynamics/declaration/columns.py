@@ -39,13 +39,13 @@ from stlc.dynamics.declaration.schema.record import (
 from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence
 from stlc.grammar import ast
 from stlc.registry import INTEGRATORS
-from stlc.signature import MAX_COMPONENTS, Column, Role
+from stlc.signature import Column, Role
 from stlc.units import Unit
 
 Ranges = tuple[tuple[float, float], ...]
 
 RANGE = raw({"type": "array", "prefixItems": [VECTOR, VECTOR], "minItems": 2, "maxItems": 2})
-_SIZE = integer(high=MAX_COMPONENTS)
+_SIZE = integer(high=Column.MAX_COMPONENTS)
 _ENUM = raw({"type": ["array", "object"]})
 _FORMULA = raw(EXPRESSION)
 

@@ -20,7 +20,7 @@ from stlc.compile.ir.discretize import Grid
 from stlc.diagnostics import Diagnostic
 from stlc.dynamics.declaration.deployment import BackupDecl, JudgeRef, ScenarioDecl, TestDecl, WorldRef
 from stlc.dynamics.declaration.functions import FunctionDecl
-from stlc.dynamics.declaration.init import InitDecl
+from stlc.dynamics.declaration.init import FileDecl, InitDecl
 from stlc.dynamics.declaration.inputs import InputDecl
 from stlc.dynamics.declaration.learning import Feedback, ObjectiveDecl, PolicyDecl, TrainDecl
 from stlc.dynamics.declaration.motion import Assign, JumpDecl
@@ -165,6 +165,24 @@ class SystemDecl:
         """
         named = (self.test.judge, *(scenario.judge for scenario in self.scenarios))
         return tuple(judge for judge in named if judge is not None)
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """Files that the system file refers to: name -> path.
+
+        These are the files that the system file extends, the files of its functions, and files of initial
+        states. If a file is below the folder of the system file, its name is its path relative to this
+        folder. Otherwise its name is its file name.
+        """
+        home = self.path.parent.resolve()
+        named = [Path(base.name) for base in self.bases]
+        named += [function.module for function in self.functions if isinstance(function.module, Path)]
+        named += [part.points.path for part in self.init.mixture if isinstance(part.points, FileDecl)]
+        found: dict[str, Path] = {}
+        for path in (each.resolve() for each in named if each.is_file()):
+            below = path.is_relative_to(home)
+            found[path.relative_to(home).as_posix() if below else path.name] = path
+        return found
 
     def judges_by(self, spec: Path) -> bool:
         """True if the key `judge` of the section `test` or of a scenario refers to the file `spec`.

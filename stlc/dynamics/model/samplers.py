@@ -28,7 +28,7 @@ from stlc.dynamics.declaration.init import FileDecl, GridDecl, InitDecl, Situati
 from stlc.dynamics.declaration.motion import Assign
 from stlc.signature import Column
 from stlc.trace import read_recording
-from stlc.trace.enums import in_numbers, words_of
+from stlc.trace.enums import in_numbers
 from stlc.trace.recording import Recording, conversion
 
 Draw: TypeAlias = Callable[[str, list[Any]], Array]
@@ -456,7 +456,7 @@ class _File:
         path = self._decl.path
         try:
             recording = read_recording(path)
-            words = {column.name: words_of(column) for column in self._decl.columns}
+            words = {column.name: column.words for column in self._decl.columns}
             recording = in_numbers(recording, words)
             arrays = {group.named: group.clock for group in recording.groups if group.clock is not None}
             arrays |= {name: each for group in recording.groups for name, each in group.arrays.items()}
@@ -476,7 +476,7 @@ class _File:
         if bad:
             raise self._refused(f"`{path}` holds NaN or infinity in `{bad[0]}`")
         for each in self._decl.columns:
-            worth = words_of(each)
+            worth = each.words
             odd = np.setdiff1d(columns[each.name].numpy(), list(worth.values())) if worth else np.zeros(0)
             if odd.size:
                 listed = ", ".join(worth)

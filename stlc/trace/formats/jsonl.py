@@ -18,7 +18,7 @@ import numpy as np
 
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.escape import encodable
-from stlc.signature import MAX_COMPONENTS
+from stlc.signature import Column
 from stlc.trace.formats.cells import Array, bare, is_missing, value_of
 from stlc.trace.formats.registry import MAX_LETTERS, require_room, unreadable
 from stlc.trace.formats.table import MAX_LINE, place, size, text_lines, unpacked, utf8
@@ -110,7 +110,7 @@ def _flat(value: Any, name: str, wanted: Wanted) -> Iterator[tuple[str, Any]]:
     if isinstance(value, tuple):
         for key, each in value:
             yield from _flat(each, f"{name}.{encodable(key)}" if name else encodable(key), wanted)
-    elif isinstance(value, list) and len(value) <= MAX_COMPONENTS and name not in (wanted.names or ()):
+    elif isinstance(value, list) and len(value) <= Column.MAX_COMPONENTS and name not in (wanted.names or ()):
         for i, each in enumerate(value):
             yield from _flat(each, f"{name}[{i}]", wanted)
     else:

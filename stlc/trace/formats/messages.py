@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, StlcError, TraceError
 from stlc.extras import needed
-from stlc.signature import MAX_COMPONENTS, Column
+from stlc.signature import Column
 from stlc.trace.formats.paths import ARRAYS, HEADER, Enclosing, Path, RefusedError, Selection, element_names
 from stlc.trace.formats.registry import MAX_LETTERS, opened, unreadable
 from stlc.trace.recording import ALL, Array, ClockGroup, Recording, Wanted
@@ -147,7 +147,7 @@ class _Signal:
             return np.array([self.others.get(i, word) for i, word in enumerate(words)], dtype=np.str_)
         least, most = min(map(len, vectors)), max(map(len, vectors))
         mixed = len(vectors) < len(self.others) or not np.isnan(numbers).all()
-        if least != most or most > MAX_COMPONENTS or mixed:
+        if least != most or most > Column.MAX_COMPONENTS or mixed:
             told = f"is an array of {least} to {most} numbers"
             raise RefusedError(f"{told}: read an element such as `[0]`, or `min(…)` or `max(…)` of it")
         stacked = np.full((count, most), math.nan)

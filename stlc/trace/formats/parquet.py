@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from stlc.diagnostics import TraceError, UsageError
 from stlc.extras import needed
 from stlc.files import File
-from stlc.signature import MAX_COMPONENTS
+from stlc.signature import Column
 from stlc.trace.formats.arrays import Array, Arrays
 from stlc.trace.formats.csv import split_head
 from stlc.trace.formats.registry import MAX_LETTERS, damage, require_room, unreadable
@@ -163,8 +163,8 @@ def _values(name: str, chunked: Any) -> Mapping[str, Array]:
     there = np.asarray(lists.is_valid())
     lengths = np.asarray(needed("pyarrow.compute").list_value_length(lists.drop_null()))
     size = int(lengths.max(initial=0))
-    if not 1 <= size <= MAX_COMPONENTS or (lengths != size).any():
-        raise ValueError(f"lists of differing lengths, or of more than {MAX_COMPONENTS} numbers")
+    if not 1 <= size <= Column.MAX_COMPONENTS or (lengths != size).any():
+        raise ValueError(f"lists of differing lengths, or of more than {Column.MAX_COMPONENTS} numbers")
     flat = _numbers(lists.flatten()).reshape(-1, size)
     if not there.all():
         flat, given = np.full((len(there), size), np.nan), flat

@@ -20,7 +20,7 @@ from stlc.assurance.verification.network import NetworkBounds, NetworkLayer
 from stlc.assurance.verification.onnx_layers import read_onnx
 from stlc.assurance.verification.verify import Verifier
 from stlc.cli.framework.app import main
-from stlc.controller.problem.load import load_task
+from stlc.controller.problem.task import Task
 from stlc.diagnostics import UsageError
 
 ROOT = Path(__file__).parents[3]
@@ -36,7 +36,7 @@ def random_layers(kind: str, inputs: int = 2, outputs: int = 1) -> list[NetworkL
 
 @cache
 def loop(kind: str, period: int = 2, *, continuous: bool = False, substeps: int = 1) -> NetworkLoop:
-    task = load_task(SPEC, overrides={"time.substeps": str(substeps)})
+    task = Task.load(SPEC, overrides={"time.substeps": str(substeps)})
     return NetworkLoop(task, random_layers(kind), period, continuous=continuous)
 
 
@@ -83,7 +83,7 @@ def test_outputs_of_a_network_stay_within_their_forms(kind: str) -> None:
 
 
 def test_sampled_states_of_proved_boxes_satisfy_the_specification() -> None:
-    subject = NetworkLoop(load_task(SPEC), [NetworkLayer(np.array([[-2.0, -1.0]]), np.zeros(1))])
+    subject = NetworkLoop(Task.load(SPEC), [NetworkLayer(np.array([[-2.0, -1.0]]), np.zeros(1))])
     result = Verifier(subject, seed=2).run(1e6, boxes=200).modes[0]
     assert result.proved > 0.3
     rng = np.random.default_rng(6)
@@ -217,10 +217,10 @@ def test_operations_that_are_no_linear_map_are_refused(tmp_path: Path, options: 
 
 def test_a_network_of_other_sizes_is_refused() -> None:
     with pytest.raises(UsageError, match="takes 3 numbers"):
-        NetworkLoop(load_task(SPEC), random_layers("relu", inputs=3))
+        NetworkLoop(Task.load(SPEC), random_layers("relu", inputs=3))
 
 
 def test_solutions_of_a_system_with_jumps_are_refused() -> None:
-    task = load_task(ROOT / "specs" / "traffic.stl")
+    task = Task.load(ROOT / "specs" / "traffic.stl")
     with pytest.raises(UsageError, match="cannot be bounded"):
         NetworkLoop(task, random_layers("relu", inputs=7), continuous=True)

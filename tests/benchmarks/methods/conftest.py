@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from stlc.controller.problem.load import load_task
 from stlc.controller.problem.task import Task
 
 ROOT = Path(__file__).parents[3]
@@ -15,4 +14,4 @@ ROOT = Path(__file__).parents[3]
 @pytest.fixture(scope="session")
 def car_task() -> Task:
     """`specs/traffic.stl` with `examples/car.yaml`."""
-    return load_task(ROOT / "specs/traffic.stl", "car.yaml")
+    return Task.load(ROOT / "specs/traffic.stl", "car.yaml")

@@ -14,7 +14,7 @@ import torch
 from stlc.controller.deployment.simulator import DeploymentRecording
 from stlc.controller.evaluation.causes import Lost
 from stlc.controller.evaluation.executed import Executed
-from stlc.controller.evaluation.rules import JudgedRuns, Rules, judge_runs, judge_runs_by_plans, rules_of
+from stlc.controller.evaluation.rules import JudgedRuns, Rules, judge_runs, judge_runs_by_plans
 from stlc.controller.problem.task import Task
 from stlc.controller.run.run import Run
 from stlc.controller.search.local_search import SearchResult
@@ -79,7 +79,7 @@ def run_of(home: Path, overrides: Mapping[str, str] | None = None) -> RunDir:
 
 
 def found(run: Run) -> Rules:
-    rules = rules_of(run)
+    rules = Rules.of(run)
     assert rules is not None
     return rules
 
@@ -138,7 +138,7 @@ def test_constants_that_were_changed_are_changed_in_the_rules_too(home: Path) ->
 
 def test_rules_may_be_left_out_or_given_anew(home: Path) -> None:
     folder = run_of(home)
-    assert rules_of(opened(folder, {"test.judge": "null"})) is None
+    assert Rules.of(opened(folder, {"test.judge": "null"})) is None
     assert found(opened(folder, {"test.judge": str(home / "car/far.stl")})).name == "far"
 
 
@@ -163,7 +163,7 @@ def test_a_copy_that_is_damaged_is_said(home: Path, broken: str) -> None:
     folder = run_of(home)
     (folder.path / "judge/index.json").write_text(broken)
     with pytest.raises(RunError) as caught:
-        rules_of(opened(folder))
+        Rules.of(opened(folder))
     assert caught.value.diagnostics[0].code == ("R110" if "x.stl" in broken else "R101")
 
 

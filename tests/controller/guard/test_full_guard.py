@@ -15,7 +15,7 @@ from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.search import StagedSearch
 from stlc.controller.problem.task import Task
 from stlc.controller.search.ascent import GradientAscent
-from stlc.controller.search.feasibility import safety_task, viable
+from stlc.controller.search.feasibility import viable
 from tests.controller.guard.test_prefix_shooting import F64, Constant, failing, grid
 
 QUICK = Limits(seconds=None, tries=256, drawn=30, guesses=2)
@@ -119,7 +119,7 @@ def test_plans_that_are_no_numbers_are_places_too(car_task: Task) -> None:
 
 
 def test_phi_safe_alone_is_a_task(car_task: Task) -> None:
-    alone = safety_task(car_task)
+    alone = car_task.safety_task
     x = car_task.sample(50, seed=1, dtype=F64)
     u = torch.zeros(50, car_task.horizon, 1, dtype=F64)
     assert torch.equal(alone.judge(x, u).rho, car_task.judge(x, u).safe)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stlc.controller.parallel.jobs import Job, LocalExecutor, core_shares
-from stlc.rundir import every_run
+from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[3]
 SPEC = str(ROOT / "specs" / "traffic.stl")
@@ -45,10 +45,10 @@ def test_what_is_no_longer_wanted_is_saved(tmp_path: Path) -> None:
     waiting = LocalExecutor(2).run([long, bad])
     assert next(waiting).job.name == "bad"
     deadline = time.monotonic() + 60
-    while not any(run.record().get("engine") for run in every_run(tmp_path)):
+    while not any(run.record().get("engine") for run in RunDir.every(tmp_path)):
         assert time.monotonic() < deadline
         time.sleep(0.05)
     waiting.close()
-    (run,) = every_run(tmp_path)
+    (run,) = RunDir.every(tmp_path)
     assert run.status == "interrupted"
     assert (run.path / "ckpt" / "last.json").is_file() or not list(run.rows()), "nothing done is lost"

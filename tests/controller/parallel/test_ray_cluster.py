@@ -22,7 +22,7 @@ from stlc.controller.parallel.ray_jobs import RayExecutor
 from stlc.controller.parallel.workers import CallFiles, results
 from stlc.diagnostics import MissingError
 from stlc.extras import installation
-from stlc.rundir import every_run
+from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[3]
 SPECS = [str(ROOT / "specs" / name) for name in ("traffic.stl", "ship_safe.stl")]
@@ -160,9 +160,9 @@ def test_specifications_are_trained_for_on_a_cluster(
     document = json.loads(capsys.readouterr().out)
     assert document["exit_code"] == code
     assert [run["spec"] for run in document["result"]["runs"]] == SPECS
-    assert sorted(run.path.parent.name for run in every_run(tmp_path)) == ["ship_safe", "traffic"]
-    assert {run.status for run in every_run(tmp_path)} == {"finished"}
-    assert {run.path for run in every_run(tmp_path)} == {
+    assert sorted(run.path.parent.name for run in RunDir.every(tmp_path)) == ["ship_safe", "traffic"]
+    assert {run.status for run in RunDir.every(tmp_path)} == {"finished"}
+    assert {run.path for run in RunDir.every(tmp_path)} == {
         Path(run["run"]).resolve() for run in document["result"]["runs"]
     }
 
@@ -175,10 +175,10 @@ def test_what_is_no_longer_wanted_is_saved(tmp_path: Path) -> None:
     bad = Job("bad", ("--stepps", "2"), (), tmp_path)
     waiting = RayExecutor("local").run([long, bad])
     assert next(waiting).job.name == "bad"
-    while not any(run.record().get("engine") for run in every_run(tmp_path)):
+    while not any(run.record().get("engine") for run in RunDir.every(tmp_path)):
         time.sleep(0.05)
     waiting.close()
-    (run,) = every_run(tmp_path)
+    (run,) = RunDir.every(tmp_path)
     assert run.status == "interrupted"
 
 

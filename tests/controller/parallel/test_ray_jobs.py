@@ -20,7 +20,7 @@ from stlc.controller.parallel.workers import CallFiles, LostCall
 from stlc.controller.problem.inputs import input_files
 from stlc.controller.run.checkpoint import load_checkpoint, save_checkpoint
 from stlc.diagnostics import RunError
-from stlc.rundir import RunDir, every_run
+from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[3]
 QUICK = ("--method", "gradient", "--held-out", "20", "--batch", "8", "--threads", "1", "--no-pictures")
@@ -82,7 +82,7 @@ def test_a_worker_that_does_not_see_the_folders_sends_the_run(project: Path, wor
     RunDir.create(home, "traffic", "earlier")
     (back,) = RayExecutor("far").run([job("--name", "far", runs=home)])
     assert (back.code in (0, 1), back.cores) == (True, 1), back.said
-    (run,) = every_run(home)
+    (run,) = RunDir.every(home)
     assert run.name == "0002-far"
     assert run.status == "finished"
     assert back.result["run"] == run.shown
@@ -97,13 +97,13 @@ def test_a_worker_that_does_not_see_the_folders_sends_the_run(project: Path, wor
 def test_a_run_is_continued_elsewhere(workers: type[Workers]) -> None:
     workers.sees = False
     (first,) = RayExecutor("far").run([job()])
-    (run,) = every_run(Path("runs"))
+    (run,) = RunDir.every(Path("runs"))
     other = RunDir.create(Path("runs"), "traffic", "other")
     other.update({"status": "interrupted"})
     words = ("--resume", str(run.path), "--steps", "4", "--no-pictures")
     (back,) = RayExecutor("far").run([Job("on", words, (run.path,), Path("runs"))])
     assert back.result["run"] == first.result["run"] == run.shown
-    assert [(each.name, each.status) for each in every_run(Path("runs"))] == [
+    assert [(each.name, each.status) for each in RunDir.every(Path("runs"))] == [
         (run.name, "finished"),
         (other.name, "interrupted"),
     ]

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 import stlc
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.problem.load import load_task
 from stlc.controller.problem.native import Effort
 from stlc.controller.problem.task import Task
 from stlc.controller.search.planner import PlanBudget, plan
@@ -55,7 +54,7 @@ def test_plans_and_recordings_have_one_verdict_whatever_the_scale(name: str, tmp
         "control: {u: {range: [-1, 1]}}\nflow: {f: 0 N/s * u}\n"
         f"init: {{mixture: [{{draw: {{x: {start}, f: 0, go: 0}}}}]}}\n"
     )
-    task = load_task(spec, str(system))
+    task = Task.load(spec, str(system))
     x0 = task.sample(4, seed=1, dtype=torch.float64)
     u = torch.zeros(4, task.horizon, 1, dtype=torch.float64)
     judged = task.judge(x0, u)

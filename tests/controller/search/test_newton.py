@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import stlc
-from stlc.controller.problem.load import load_task
 from stlc.controller.problem.native import NativeStep
 from stlc.controller.problem.task import Task
 from stlc.controller.search.descent import Descent
@@ -40,7 +39,7 @@ def unstable(folder: Path, requirement: str) -> Task:
     (folder / "unstable.yaml").write_text(UNSTABLE)
     text = f'spec s\nsystem "unstable.yaml"\nstate signal x [m]\nrequire goal: {requirement}\n'
     (folder / "s.stl").write_text(text)
-    return load_task(folder / "s.stl")
+    return Task.load(folder / "s.stl")
 
 
 def circles(text: str) -> Task:
@@ -148,6 +147,6 @@ def test_feedback_keeps_a_change_from_growing(tmp_path: Path, requirement: str) 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["rotors", "swingup", "ballbeam", "imager", "microgrid"])
 def test_unstable_and_precise_tasks_have_plans(name: str) -> None:
-    task = load_task(ROOT / f"benchmarks/tasks/{name}/{name}.stl", whole=True)
+    task = Task.load(ROOT / f"benchmarks/tasks/{name}/{name}.stl", whole=True)
     found = plan(task, task.sample(10, seed=0, dtype=torch.float64), budget=PlanBudget(5.0))
     assert int(found.satisfied.sum()) >= 9

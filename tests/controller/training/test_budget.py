@@ -32,7 +32,7 @@ from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.loop import Watch, resume, train
 from stlc.diagnostics import UsageError
-from stlc.rundir import RunDir, every_run
+from stlc.rundir import RunDir
 
 EVERY = 50
 
@@ -424,6 +424,6 @@ def test_half_a_minute_is_half_a_minute_on_an_idle_machine_and_on_a_busy_one(
         for other in others:
             other.kill()
             other.wait()
-    (run,) = every_run(tmp_path)
+    (run,) = RunDir.every(tmp_path)
     assert run.record()["result"]["seconds"] == pytest.approx(30.0, rel=0.1)
     assert whole <= 1.2 * 30.0 + 10.0

@@ -23,7 +23,7 @@ from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.learner import Trainer
 from stlc.controller.training.loop import Watch, resume, train
 from stlc.diagnostics import MissingError, StlcError, UsageError
-from stlc.rundir import RunDir, every_run
+from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[3]
 CONFIG = TrainConfig(held_out=20, steps=12, seed=3, batch=8, threads=1)
@@ -205,7 +205,7 @@ def test_torchrun_on_the_command_line(number: int, status: str, tmp_path: Path) 
     os.killpg(process.pid, number)
     said += process.communicate(timeout=120)[1]
     assert "go on with: torchrun --nproc-per-node 2 -m stlc train --resume" in said
-    (run,) = every_run(tmp_path)
+    (run,) = RunDir.every(tmp_path)
     assert run.status == status
     words = ["--resume", str(run.path), "--steps", str(int(_facts(run)) + 5), "--no-pictures"]
     done = subprocess.run([*start, *words], capture_output=True, text=True, check=True)

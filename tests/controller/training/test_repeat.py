@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from stlc.controller.run.checkpoint import load_checkpoint
-from stlc.rundir import RunDir, every_run
+from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[3]
 SPECS = ["traffic", "reach_n_avoid", "ship_safe", "ship_track", "navigation", "manipulation", "patrol"]
@@ -42,7 +42,7 @@ def _saved(root: Path, process: subprocess.Popen[bytes]) -> RunDir:
     """The run below `root`, once it has a checkpoint."""
     deadline = time.monotonic() + 240
     while time.monotonic() < deadline:
-        found = [run for run in every_run(root) if (run.path / "ckpt" / "last.json").is_file()]
+        found = [run for run in RunDir.every(root) if (run.path / "ckpt" / "last.json").is_file()]
         if found:
             return found[0]
         assert process.poll() is None
@@ -63,7 +63,7 @@ def test_a_run_that_is_killed_ends_as_one_that_is_not(spec: str, tmp_path: Path)
     if run.status != "finished":
         again = ["train", "--resume", str(run.path), "--no-pictures"]
         assert _started(*again).wait(timeout=400) == 0
-    (whole,) = every_run(tmp_path / "whole")
+    (whole,) = RunDir.every(tmp_path / "whole")
     left, right = _tensors(whole), _tensors(run)
     assert left.keys() == right.keys()
     assert all(torch.equal(value, right[name]) for name, value in left.items())

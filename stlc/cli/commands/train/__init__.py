@@ -148,7 +148,7 @@ def _task(
     do so, plans reach to the end of missions.
     """
     from stlc.compile.deadlines import beyond_plans
-    from stlc.controller.problem.load import load_task, require_controls
+    from stlc.controller.problem.task import Task
     from stlc.controller.training.config import method_name
     from stlc.dynamics.model.feedback import unstable
     from stlc.grammar.allow import not_allowed
@@ -156,7 +156,7 @@ def _task(
     if not specs:
         example = "stlc train specs/traffic.stl --system car.yaml"
         raise usage("missing: a specification", example)
-    task = load_task(
+    task = Task.load(
         specs[0],
         system or None,
         overrides,
@@ -165,8 +165,8 @@ def _task(
         whole=True,
     )
     if task.compiled.grid.end is not None and not METHODS.get(method_name(task, method)).whole:
-        task = load_task(specs[0], system or None, overrides)
-    require_controls(task)
+        task = Task.load(specs[0], system or None, overrides)
+    task.require_controls()
     late = not_allowed(beyond_plans(task.compiled))
     show_diagnostics([*task.compiled.warnings, *late, *unstable(task.plain.decl)])
     return task

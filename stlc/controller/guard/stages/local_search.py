@@ -8,7 +8,6 @@ from torch import Tensor
 from stlc.controller.guard.candidates import REPAIRED, Candidates, Deadline
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup
 from stlc.controller.problem.task import Task
-from stlc.controller.search.feasibility import safety_task
 from stlc.controller.search.local_search import Searcher
 
 
@@ -24,7 +23,7 @@ class LocalSearch(GuardStage):
         self.task, self.tries = task, setup.limits.tries
         self.whole = self._safe = Searcher(task, generator, target=setup.target)
         if 0 < len(task.compiled.safety) < len(task.rules):
-            self._safe = Searcher(safety_task(task), generator, target=setup.target)
+            self._safe = Searcher(task.safety_task, generator, target=setup.target)
 
     def wanted(self, best: Candidates) -> Tensor:
         """Mask of the agents whose plan has less than the target robustness."""

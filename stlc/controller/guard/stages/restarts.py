@@ -6,7 +6,7 @@ from torch import Tensor
 
 from stlc.controller.guard.candidates import REPAIRED, Candidates, Deadline
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup
-from stlc.controller.search.feasibility import safety_task, solve
+from stlc.controller.search.feasibility import solve
 
 
 class Restarts(GuardStage):
@@ -14,7 +14,7 @@ class Restarts(GuardStage):
 
     def __init__(self, setup: Setup) -> None:
         self.task, self.rescue = setup.task, setup.limits.rescue
-        self._safety = safety_task(setup.task) if setup.task.compiled.safety else setup.task
+        self._safety = setup.task.safety_task if setup.task.compiled.safety else setup.task
 
     def wanted(self, best: Candidates) -> Tensor:
         """Mask of the agents without a safe plan; all False if `Limits.rescue` is False."""

@@ -11,7 +11,7 @@ from helpers.documents import misfits
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
 from stlc.controller.parallel.jobs import Job, JobResult
-from stlc.rundir import every_run
+from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[4]
 SPEC = str(ROOT / "specs/traffic.stl")
@@ -63,11 +63,11 @@ def test_every_seed_is_a_run_of_its_own(
     document = json.loads(capsys.readouterr().out)
     assert document["exit_code"] == code == max(run["exit_code"] for run in document["result"]["runs"])
     assert misfits(document, load_schema("train/1")) == []
-    records = [run.record() for run in every_run(tmp_path)]
+    records = [run.record() for run in RunDir.every(tmp_path)]
     assert sorted(record["seed"] for record in records) == [3, 4]
     assert all(record["overrides"] == {"T_red": "3s"} for record in records)
     assert all(record["threads"] == 1 for record in records)
-    assert {run.name.partition("-")[2] for run in every_run(tmp_path)} == {"pair-seed3", "pair-seed4"}
+    assert {run.name.partition("-")[2] for run in RunDir.every(tmp_path)} == {"pair-seed3", "pair-seed4"}
 
 
 @pytest.mark.parametrize(("ended", "code"), [(3, 3), (-9, 70)])
@@ -106,7 +106,7 @@ def test_every_specification_is_trained_for_and_one_that_fails_stops_no_other(
     assert code == document["exit_code"] == bad["exit_code"] == 3
     assert bad["why"].startswith("error[E")
     assert (bad["spec"], good["spec"], good["seed"]) == (str(broken), SPEC, 3)
-    (run,) = every_run(tmp_path / "runs")
+    (run,) = RunDir.every(tmp_path / "runs")
     assert (run.shown, run.record()["seed"], run.status) == (good["run"], 3, "finished")
 
 

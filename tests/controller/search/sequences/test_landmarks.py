@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from stlc.compile.ir.text import show_formula
-from stlc.controller.problem.load import load_task
+from stlc.controller.problem.task import Task
 from stlc.controller.search.sequences.sequences import Sequences
 
 MISSIONS = Path(__file__).parents[3] / "data/sequences"
@@ -15,7 +15,7 @@ MISSIONS = Path(__file__).parents[3] / "data/sequences"
 
 @pytest.fixture(scope="module")
 def lift() -> Sequences:
-    task = load_task(MISSIONS / "lift.stl")
+    task = Task.load(MISSIONS / "lift.stl")
     return Sequences(task, task.sample(1, seed=0)[0].double())
 
 

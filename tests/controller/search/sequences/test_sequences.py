@@ -10,7 +10,6 @@ import pytest
 from stlc.controller.deployment.batched import Setting
 from stlc.controller.deployment.simulator import Recorder, simulate
 from stlc.controller.guard.guard import Guard
-from stlc.controller.problem.load import load_task
 from stlc.controller.problem.task import Task
 from stlc.controller.search.planner import PlanBudget, plan, planner_named
 from stlc.controller.search.planner_policy import PlannerPolicy
@@ -23,7 +22,7 @@ MISSIONS = Path(__file__).parents[3] / "data/sequences"
 
 @pytest.fixture(scope="module")
 def handover() -> Task:
-    return load_task(MISSIONS / "handover.stl")
+    return Task.load(MISSIONS / "handover.stl")
 
 
 def names_of(sequences: Sequences, steps: frozenset[int]) -> set[str]:
@@ -80,7 +79,7 @@ def test_a_phase_is_short_where_safety_binds_the_way_to_its_target(tmp_path: Pat
         "@safety\nrequire aligned: always[0, T] (out > 0.15 -> facing(0) or facing(2.1) or facing(4.2))\n"
         "require taken: eventually[0, T] got\n"
     )
-    task = load_task(tmp_path / "take.stl")
+    task = Task.load(tmp_path / "take.stl")
     x0 = task.sample(1, seed=0)[0].double()
     sequences = Sequences(task, x0)
     if sequences._phases is None:
@@ -108,7 +107,7 @@ def test_a_phase_begins_with_what_reached_another_target(tmp_path: Path) -> None
         "@safety\nrequire aligned: always[0, T] (out > 0.15 -> abs(th) <= 0.12)\n"
         "require taken: eventually[0, T] got\nrequire fed: eventually[0, T] fed\n"
     )
-    task = load_task(tmp_path / "take.stl")
+    task = Task.load(tmp_path / "take.stl")
     x0 = task.sample(1, seed=0)[0].double()
     sequences = Sequences(task, x0)
     if sequences._phases is None:
@@ -144,7 +143,7 @@ def test_a_target_out_of_reach_is_approached(handover: Task) -> None:
     ],
 )
 def test_missions_of_many_steps_are_planned(mission: str) -> None:
-    task = load_task(MISSIONS / f"{mission}.stl")
+    task = Task.load(MISSIONS / f"{mission}.stl")
     if task.native is None:
         pytest.skip("no C compiler")
     found = plan(task, task.sample(1, seed=4), budget=PlanBudget(30.0), seed=1)
@@ -152,7 +151,7 @@ def test_missions_of_many_steps_are_planned(mission: str) -> None:
 
 
 def test_timers_and_heaters_are_regressed_to_jumps() -> None:
-    task = load_task(MISSIONS / "recipe.stl")
+    task = Task.load(MISSIONS / "recipe.stl")
     x0 = task.sample(1, seed=0)[0].double()
     sequences = Sequences(task, x0)
     root = sequences.root(x0)
@@ -163,7 +162,7 @@ def test_timers_and_heaters_are_regressed_to_jumps() -> None:
 
 
 def test_each_goal_in_a_chain_is_a_step() -> None:
-    task = load_task(MISSIONS / "glider.stl")
+    task = Task.load(MISSIONS / "glider.stl")
     state = task.sample(1, seed=0)[0].double()
     root = Sequences(task, state).root(state)
     assert root is not None
@@ -188,7 +187,7 @@ def test_a_search_goes_on_where_the_last_one_ended(handover: Task) -> None:
 
 @pytest.mark.slow
 def test_calls_that_no_plan_foresees_are_answered() -> None:
-    task = load_task(MISSIONS / "lift.stl", whole=True)
+    task = Task.load(MISSIONS / "lift.stl", whole=True)
     if task.native is None:
         pytest.skip("no C compiler")
     policy = PlannerPolicy(task, planner_named("search"), PlanBudget(1.0, 12_000), seed=0)
