@@ -1,9 +1,9 @@
 """Escaping of untrusted text for C, markup, tables, terminals, shells and paths.
 
-Names, comments, units and file names come from untrusted files. For each kind of output there is one function
-here, and every text for this output passes through it. If the output can represent every character, reading
-it restores the text exactly. If it cannot (a comment, a terminal, a picture), the other characters become
-visible symbols.
+Names, comments, units and file names come from untrusted files. For each kind of output there is one
+function, here or in the module that writes it, and every text for this output passes through it. If the
+output can represent every character, reading it restores the text exactly. If it cannot (a comment, a
+terminal, a picture), the other characters become visible symbols.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import html as _html
 import re
 import shlex
 from collections.abc import Iterable
-from urllib.parse import quote
 
 _UNSEEN = (
     r"\x00-\x1f\x7f-\x9f\xad\u0600-\u0605\u061c\u06dd\u070f\u0890\u0891\u08e2\u180e\u200b-\u200f\u2028-\u202e"
@@ -141,12 +140,6 @@ def html(text: str) -> str:
     return _html.escape(lawful(text), quote=True)
 
 
-def script_json(text: str) -> str:
-    """Escape a JSON text for a `<script>` element, so that it cannot end the element or open a comment."""
-    return text.translate(_IN_SCRIPT)
-
-
-_IN_SCRIPT = str.maketrans({char: f"\\u{ord(char):04x}" for char in "<>&\u2028\u2029"})
 _REFUSED_IN_MARKUP = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff\ufdd0-\ufdef\ufffe\uffff]"
 )
@@ -167,71 +160,7 @@ def markdown(text: str) -> str:
     return re.sub(r"^ +| +\Z", lambda match: "\N{NO-BREAK SPACE}" * len(match[0]), words)
 
 
-def markdown_code(text: str) -> str:
-    """Return a name as inline code in Markdown; back quotes in the name are kept."""
-    words = visible(text)
-    longest = max(map(len, re.findall("`+", words)), default=0)
-    fence = "`" * (longest + 1)
-    blank = " " if words.startswith("`") or words.endswith("`") or words != words.strip() or not words else ""
-    return f"{fence}{blank}{words}{blank}{fence}"
-
-
-def workflow_data(text: str) -> str:
-    """Escape the message of a workflow command of GitHub Actions (`::error::message`), in one line."""
-    return visible(text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A"))
-
-
-def workflow_property(text: str) -> str:
-    """Escape the value of a property of a workflow command of GitHub Actions, such as its file name."""
-    return workflow_data(text).replace(":", "%3A").replace(",", "%2C")
-
-
-def sarif_message(text: str) -> str:
-    """Escape links and placeholders in a plain message of SARIF 2.1.0 (sections 3.11.5 and 3.11.6)."""
-    return re.sub(r"\](?=\()", r"\\]", re.sub(r"\{(\d+)\}", r"{{\1}}", text))
-
-
-def uri(path: str) -> str:
-    """Return a path as a relative URI reference, in which special characters are percent-encoded."""
-    return quote(path.replace("\\", "/"), safe="/-._~+@=,()", errors="surrogateescape")
-
-
-def dot(text: str) -> str:
-    """Return a text as a string in double quotes for the graph language of Graphviz."""
-    return '"' + visible(text).replace("\\", "\\\\").replace('"', '\\"') + '"'
-
-
 # ---------------------------------------------------------------- pictures and logs
-
-
-LABEL = 60
-"""Maximum number of characters of a label in a picture."""
-
-
-def picture(text: str) -> str:
-    """Return a label for a picture, truncated to `LABEL` characters.
-
-    Matplotlib omits labels with a leading underscore from legends, so a thin space is put before the
-    underscore.
-    """
-    words = visible(text if len(text) <= LABEL else f"{text[: LABEL - 1]}…")
-    return f"\N{THIN SPACE}{words}" if words.startswith("_") else words
-
-
-def tag(name: str) -> str:
-    """Return a name as one part of a TensorBoard tag, without the `/` that separates groups.
-
-    Different names have different results.
-    """
-    return re.sub(r"[^\w.-]|_(?=x[0-9a-f]+_)", lambda match: f"_x{ord(match[0]):x}_", name)
-
-
-def topic(name: str, *, empty: str) -> str:
-    """Return a name as one part of the topic of a message: letters, digits, `_`, `-` and `.`.
-
-    Other characters become `_`; `empty` replaces an empty name.
-    """
-    return re.sub(r"[^\w.-]+", "_", name) or empty
 
 
 def json_text(text: str) -> str:

@@ -20,6 +20,8 @@ from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 
 from stlc import escape, native
+from stlc.cli.commands.compile.tree_text import dot
+from stlc.cli.commands.lint import sarif_message, uri, workflow_data, workflow_property
 from stlc.jsontext import dumps, loads
 
 texts = st.text(st.characters(), max_size=40)
@@ -175,7 +177,8 @@ def test_any_text_is_xml(text: str) -> None:
 
 @given(texts)
 def test_json_in_a_page_ends_no_script(text: str) -> None:
-    written = escape.script_json(dumps({"name": text, text: 1}))
+    script_json = pytest.importorskip("stlc.view.player").script_json
+    written = script_json(dumps({"name": text, text: 1}))
     assert not set(written) & set("<>&")
     assert json.loads(written) == {"name": text, text: 1}
 
@@ -192,8 +195,9 @@ def test_markdown_is_one_paragraph_of_text() -> None:
 
 
 def test_markdown_code_is_one_name_in_code_letters() -> None:
+    markdown_code = pytest.importorskip("stlc.editor.hover").markdown_code
     for name in NAMES:
-        written = MarkdownIt().render(f"a {escape.markdown_code(name)} b")
+        written = MarkdownIt().render(f"a {markdown_code(name)} b")
         assert elements(written) == ["p", "code"]
         assert " ".join(escape.visible(name).split()) in " ".join("".join(words(written)).split())
 
@@ -213,28 +217,25 @@ def words(markup: str) -> list[str]:
 
 def test_graphviz_reads_one_word() -> None:
     for name in NAMES:
-        written = escape.dot(name)
+        written = dot(name)
         assert re.fullmatch(r'"(?:[^"\\]|\\["\\])*"', written)
         assert re.sub(r"\\(.)", r"\1", written[1:-1]) == escape.visible(name)
 
 
 @given(texts)
 def test_workflow_commands_are_one_line_and_one_property(text: str) -> None:
-    assert len(escape.workflow_data(text).splitlines()) <= 1
-    written = escape.workflow_property(text)
+    assert len(workflow_data(text).splitlines()) <= 1
+    written = workflow_property(text)
     assert not set(written) & set(":,\r\n")
 
 
 def test_a_message_of_sarif_has_no_link_and_no_argument() -> None:
-    assert (
-        escape.sarif_message("[here](file:///etc/passwd) {0} [m/s]")
-        == "[here\\](file:///etc/passwd) {{0}} [m/s]"
-    )
+    assert sarif_message("[here](file:///etc/passwd) {0} [m/s]") == "[here\\](file:///etc/passwd) {{0}} [m/s]"
 
 
 @given(whole)
 def test_an_address_gives_the_path_back(path: str) -> None:
-    written = escape.uri(path)
+    written = uri(path)
     assert re.fullmatch(r"[\w/\-.~+@=,()%]*", written, re.A)
     assert unquote(written) == path.replace("\\", "/")
 
@@ -267,10 +268,11 @@ def test_what_a_spreadsheet_shows_is_read_back(text: str) -> None:
 
 
 def test_tags_are_parts_of_their_own() -> None:
-    tags = [escape.tag(name) for name in NAMES]
+    tag = pytest.importorskip("stlc.controller.training.tensorboard").tag
+    tags = [tag(name) for name in NAMES]
     assert len(set(tags)) == len(NAMES)
     assert all(re.fullmatch(r"[\w.-]+", tag) for tag in tags)
-    assert escape.tag("no_collision") == "no_collision"
+    assert tag("no_collision") == "no_collision"
 
 
 def test_a_part_of_a_path_stays_in_its_folder(tmp_path: Path) -> None:

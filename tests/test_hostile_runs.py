@@ -256,6 +256,8 @@ def lived(names: list[str], spec: str, system: str, capsys: pytest.CaptureFixtur
 def look_over(names: list[str], spec: str, system: str, capsys: pytest.CaptureFixture[str]) -> Page:
     """Everything that a run leaves, read by a reader of each; gives its page."""
     pytest.importorskip("tensorboardX")
+    from stlc.controller.training import tensorboard
+
     found = lived(names, spec, system, capsys)
     run = RunDir.newest()
     assert list(json.loads(found["train"])["result"]["requirements"]) == names
@@ -270,7 +272,7 @@ def look_over(names: list[str], spec: str, system: str, capsys: pytest.CaptureFi
     assert len(parts) == 2
     (events,) = (run.path / "tensorboard").iterdir()
     tags = {tag.decode() for tag in re.findall(rb"requirements/[\w.-]+", events.read_bytes())}
-    assert {escape.tag(name).lstrip("/") for name in names if name.isascii()} <= {
+    assert {tensorboard.tag(name).lstrip("/") for name in names if name.isascii()} <= {
         tag.removeprefix("requirements/") for tag in tags
     }
     svg = ElementTree.parse("p.svg").getroot()

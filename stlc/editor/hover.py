@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
@@ -14,7 +15,7 @@ from stlc.compile.ir.nodes import Window
 from stlc.editor.document import Document, borrowed_at
 from stlc.editor.symbols import Symbol
 from stlc.editor.vocabulary import BUILT_IN, FUNCTIONS, KEYWORDS, TAGS, TEMPORAL, TYPES
-from stlc.escape import markdown, markdown_code, screen
+from stlc.escape import markdown, screen, visible
 from stlc.grammar import ast
 from stlc.grammar.printer import show
 from stlc.grammar.scan import Lexeme, lexemes
@@ -250,3 +251,12 @@ def _seconds(time: typed.Time, grid: Grid) -> str:
         return ""
     seconds = time.seconds + grid.dt * (time.steps + time.horizons * (grid.horizon or 0))
     return time_text(seconds)
+
+
+def markdown_code(text: str) -> str:
+    """Return a name as inline code in Markdown; back quotes in the name are kept."""
+    words = visible(text)
+    longest = max(map(len, re.findall("`+", words)), default=0)
+    fence = "`" * (longest + 1)
+    blank = " " if words.startswith("`") or words.endswith("`") or words != words.strip() or not words else ""
+    return f"{fence}{blank}{words}{blank}{fence}"

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.escape import picture
-from stlc.view.style import BLUE, INK, MUTED, SERIES, Picture, new_figure, picture_style
+from stlc.view.style import BLUE, INK, MUTED, SERIES, Picture, new_figure, picture, picture_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

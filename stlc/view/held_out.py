@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import StlcError
-from stlc.escape import picture
 from stlc.records import from_json
 from stlc.rundir import RunDir
 from stlc.signature import Signature
 from stlc.trace.formats.npz import read_arrays
-from stlc.view.style import BLUE, INK, MUTED, RED, Picture, new_figure, picture_style
+from stlc.view.style import BLUE, INK, MUTED, RED, Picture, new_figure, picture, picture_style
 from stlc.view.words import labelled
 
 if TYPE_CHECKING:

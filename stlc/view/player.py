@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.escape import script_json
 from stlc.jsontext import dumps
 from stlc.monitor.judgement import beside
 from stlc.rundir import RunDir
@@ -308,3 +307,11 @@ def _data(
     }
     text = Html(script_json(dumps(document)))
     return el("script", text, attrs={"type": "application/json", "id": "animation-data"})
+
+
+_IN_SCRIPT = str.maketrans({char: f"\\u{ord(char):04x}" for char in "<>&\u2028\u2029"})
+
+
+def script_json(text: str) -> str:
+    """Escape a JSON text for a `<script>` element, so that it cannot end the element or open a comment."""
+    return text.translate(_IN_SCRIPT)

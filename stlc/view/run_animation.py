@@ -16,7 +16,7 @@ import numpy as np
 
 from stlc.controller.stage import Stage, Staged
 from stlc.diagnostics import StlcError
-from stlc.escape import file_part, picture
+from stlc.escape import file_part
 from stlc.rundir import RunDir
 from stlc.source import Source
 from stlc.trace import Trace
@@ -34,6 +34,7 @@ from stlc.view.contents import archived, readable, simulation_of
 from stlc.view.region_map import RegionMap, map_animation, map_of
 from stlc.view.scene import LegendKey, Scene, SceneOptions, frames_of, keys_of, ratio_of, scene_animation
 from stlc.view.signals import Strip, decisions_of, signal_animation
+from stlc.view.style import picture
 from stlc.view.verdicts import (
     Event,
     SceneVerdicts,

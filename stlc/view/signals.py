@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.sketch import DECIDED, DECIDERS
-from stlc.escape import picture
 from stlc.signature import Column
 from stlc.trace import Trace
 from stlc.view.animation import Animation
@@ -29,6 +28,7 @@ from stlc.view.style import (
     hide_frame,
     narrow_gaps,
     new_figure,
+    picture,
     picture_style,
 )
 from stlc.view.thinning import extremes

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stlc.controller.sketch import SURROUNDINGS_ON_DARK, VIOLATED
-from stlc.escape import lawful
+from stlc.escape import lawful, visible
 from stlc.files import File
 from stlc.view import require_drawing
 
@@ -177,3 +177,17 @@ def _themed(svg: str) -> str:
     ground = f"background:var(--c{PAPER[1:]})"
     sheet = f"<style>svg{{{light};{ground}}}@media(prefers-color-scheme:dark){{svg{{{dark}}}}}</style>"
     return svg.replace(">", f">{sheet}", 1)
+
+
+LABEL = 60
+"""Maximum number of characters of a label in a picture."""
+
+
+def picture(text: str) -> str:
+    """Return a label for a picture, truncated to `LABEL` characters.
+
+    Matplotlib omits labels with a leading underscore from legends, so a thin space is put before the
+    underscore.
+    """
+    words = visible(text if len(text) <= LABEL else f"{text[: LABEL - 1]}…")
+    return f"\N{THIN SPACE}{words}" if words.startswith("_") else words

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
+from urllib.parse import quote
 
 import typer
 
@@ -13,7 +15,7 @@ from stlc.cli.framework.options import JsonOption, SpecsArgument
 from stlc.cli.framework.output import Answer, Document, emit, say, wants_color
 from stlc.cli.framework.program import command
 from stlc.diagnostics import CODES, Diagnostic, usage
-from stlc.escape import sarif_message, uri, workflow_data, workflow_property
+from stlc.escape import visible
 from stlc.files import File
 from stlc.options import Options
 from stlc.source import Span
@@ -182,3 +184,23 @@ def _location(span: Span) -> dict[str, Any]:
 
 def _ends(span: Span) -> tuple[tuple[int, int], tuple[int, int]]:
     return span.source.position(span.start), span.source.position(span.end)
+
+
+def uri(path: str) -> str:
+    """Return a path as a relative URI reference, in which special characters are percent-encoded."""
+    return quote(path.replace("\\", "/"), safe="/-._~+@=,()", errors="surrogateescape")
+
+
+def sarif_message(text: str) -> str:
+    """Escape links and placeholders in a plain message of SARIF 2.1.0 (sections 3.11.5 and 3.11.6)."""
+    return re.sub(r"\](?=\()", r"\\]", re.sub(r"\{(\d+)\}", r"{{\1}}", text))
+
+
+def workflow_data(text: str) -> str:
+    """Escape the message of a workflow command of GitHub Actions (`::error::message`), in one line."""
+    return visible(text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A"))
+
+
+def workflow_property(text: str) -> str:
+    """Escape the value of a property of a workflow command of GitHub Actions, such as its file name."""
+    return workflow_data(text).replace(":", "%3A").replace(",", "%2C")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
-from stlc.escape import markdown, tag
+from stlc.escape import markdown
 from stlc.extras import needed
 from stlc.files import place
 
@@ -69,3 +70,11 @@ def find_writer() -> Opener:
     module = "torch.utils.tensorboard" if torch_has_it else "tensorboardX"
     writer = needed(module, "`--log tensorboard` needs").SummaryWriter
     return lambda run: TensorBoardLogger(writer(str(place(run, f"{FOLDER}/events").parent)))
+
+
+def tag(name: str) -> str:
+    """Return a name as one part of a TensorBoard tag, without the `/` that separates groups.
+
+    Different names have different results.
+    """
+    return re.sub(r"[^\w.-]|_(?=x[0-9a-f]+_)", lambda match: f"_x{ord(match[0]):x}_", name)

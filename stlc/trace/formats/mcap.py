@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
@@ -20,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-from stlc.escape import topic as topic_of
 from stlc.extras import needed
 from stlc.files import File
 from stlc.jsontext import loads
@@ -233,3 +233,11 @@ def _as_written(found: Recording, ours: Mapping[str, str]) -> Recording | None:
     data = {name: np.stack([each[name] for each in parts]) for name in parts[0]}
     meta, columns = read_meta(Path(found.name), np.array(ours.get("meta", "{}")))
     return Recording(found.name, (ClockGroup(data, clock),), columns, meta)
+
+
+def topic_of(name: str, *, empty: str) -> str:
+    """Return a name as one part of the topic of a message: letters, digits, `_`, `-` and `.`.
+
+    Other characters become `_`; `empty` replaces an empty name.
+    """
+    return re.sub(r"[^\w.-]+", "_", name) or empty

@@ -8,7 +8,7 @@ from dataclasses import fields
 from fractions import Fraction
 from typing import Any
 
-from stlc.escape import dot
+from stlc.escape import visible
 from stlc.grammar import ast
 from stlc.grammar.traverse import children
 from stlc.jsontext import dumps
@@ -103,3 +103,8 @@ def as_dot(specs: Sequence[ast.Spec]) -> str:
         own, count = count, count + 1
         stack.extend((own, child) for child in reversed(list(children(node))))
     return "\n".join([*lines, "}"])
+
+
+def dot(text: str) -> str:
+    """Return a text as a string in double quotes for the graph language of Graphviz."""
+    return '"' + visible(text).replace("\\", "\\\\").replace('"', '\\"') + '"'
