@@ -11,20 +11,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, Self
 
-from stlc.source import Range, Span
+from stlc.source import Label, Range, Span
 
 Severity = Literal["error", "warning", "fact"]
 """An error; a warning, which most likely is a mistake; a fact, which stands beside a result."""
-
-
-@dataclass(frozen=True, slots=True)
-class Label:
-    """A secondary source location of a finding, and the text shown beside it."""
-
-    JSON: ClassVar = "file=span.source.name range=span.range text"
-
-    span: Span
-    text: str = ""
 
 
 @dataclass(frozen=True, slots=True)

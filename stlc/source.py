@@ -93,3 +93,17 @@ class Span:
     def to(self, other: Span) -> Span:
         """Location from the start of this one to the end of `other`."""
         return Span(self.source, self.start, other.end)
+
+    def label(self, text: str = "") -> Label:
+        """This location as a secondary one of a finding, with the text shown beside it."""
+        return Label(self, text)
+
+
+@dataclass(frozen=True, slots=True)
+class Label:
+    """A secondary source location of a finding, and the text shown beside it."""
+
+    JSON: ClassVar = "file=span.source.name range=span.range text"
+
+    span: Span
+    text: str = ""

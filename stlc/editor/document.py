@@ -24,7 +24,7 @@ from stlc.compile.ir.nodes import Window
 from stlc.compile.ir.simplify import simplify
 from stlc.compile.ir.support import reach
 from stlc.compile.ir.traverse import nodes
-from stlc.diagnostics import Diagnostic, Label, SpecError, StlcError
+from stlc.diagnostics import Diagnostic, SpecError, StlcError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.load import load_system_decl
 from stlc.editor.symbols import Symbol, SymbolNames, names_of
@@ -127,7 +127,7 @@ class Document:
 
     def _about_system(self, findings: tuple[Diagnostic, ...]) -> Finding:
         first = findings[0]
-        labels = [Label(one.span, f"{one.code}: {one.message}") for one in findings if one.span is not None]
+        labels = [one.span.label(f"{one.code}: {one.message}") for one in findings if one.span is not None]
         place = self.spec.system_span
         span = self.source.span(0, 0) if place is None else self.source.span(place.start, place.end)
         more = f" (and {len(findings) - 1} more)" if len(findings) > 1 else ""

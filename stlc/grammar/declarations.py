@@ -12,7 +12,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any, TypeAlias
 
-from stlc.diagnostics import Diagnostic, Label
+from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.grammar.builder import (
     BuildContext,
@@ -123,7 +123,7 @@ def _signals(context: BuildContext, span: Span, children: Sequence[Any]) -> tupl
                 "E010",
                 f"`from` names one column, but this declares {len(names)} signals",
                 column.span,
-                labels=(Label(names[0].span.to(names[-1].span), "the signals"),),
+                labels=(names[0].span.to(names[-1].span).label("the signals"),),
                 help=("declare them one by one",),
             )
         )
@@ -235,6 +235,6 @@ def _twice(first: Pragma, span: Span) -> Diagnostic:
         f"`{first.kind}` is given twice",
         span,
         label="again",
-        labels=(Label(first.span, "first"),),
+        labels=(first.span.label("first"),),
         help=("keep one of them",),
     )

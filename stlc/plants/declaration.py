@@ -9,7 +9,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
-from stlc.diagnostics import Label
 from stlc.dynamics.declaration.columns import unit_text
 from stlc.dynamics.declaration.inputs import InputDecl, Interpolate
 from stlc.dynamics.declaration.schema.names import Context, Names
@@ -586,7 +585,7 @@ class _Reading:
                 self._twice(variable.name, f"initial.{variable.name}", first[variable.name])
 
     def _twice(self, name: str, place: str, before: str) -> None:
-        labels = (Label(first_line(self.places[before]), "declared first"),)
+        labels = (first_line(self.places[before]).label("declared first"),)
         span = first_line(self.places[place])
         self.reader.report(
             "E102", f"`{name}` is declared twice", span, "rename one of the two", labels=labels

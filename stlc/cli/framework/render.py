@@ -10,9 +10,9 @@ import unicodedata
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from stlc.diagnostics import Diagnostic, Label
+from stlc.diagnostics import Diagnostic
 from stlc.escape import visible
-from stlc.source import Source, Span
+from stlc.source import Label, Source, Span
 
 TAB = 4
 MAX_COLUMNS = 160

@@ -21,7 +21,7 @@ from stlc.compile.frontend.values import Number, VectorValue, literal, unit_text
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS, Function
 from stlc.compile.ir.ranges import bounds
-from stlc.diagnostics import Diagnostic, Label
+from stlc.diagnostics import Diagnostic
 from stlc.signature import Kind
 from stlc.source import Span
 from stlc.units import Unit, nearest
@@ -449,9 +449,8 @@ def _compared_with_point(difference: Number, point: Number, what: str, span: Spa
     else:
         label = f"[{unit}]"
         help_ = f"make it a difference too: `{text} - 0 {unit}`"
-    labels: tuple[Label, ...] = ()
-    if difference.span is not None and point.span is not None and difference.span != span:
-        labels = (Label(difference.span, f"a difference, in [{unit.interval}]"),)
+    own, said = difference.span, f"a difference, in [{unit.interval}]"
+    labels = (own.label(said),) if own is not None and point.span is not None and own != span else ()
     verb = what if what.startswith("`") else f"cannot {what}"
     message = f"{verb} a difference of temperatures with a temperature"
     return Diagnostic("E203", message, point.span or span, label, labels, help=(help_,))
@@ -462,7 +461,7 @@ def _sum_of_points(left: Number, right: Number, span: Span) -> Diagnostic:
     first, second = ((side.span or span).text for side in (left, right))
     written = _QUANTITY.fullmatch(second)
     labels = tuple(
-        Label(side.span, f"[{side.unit}]")
+        side.span.label(f"[{side.unit}]")
         for side in (left, right)
         if side.span is not None and side.span != span
     )
@@ -528,7 +527,7 @@ def _check_divisor(function: Function, divisor: Number, span: Span, scope: Scope
     place = divisor.span or span
     if divisor.constant == 0:
         origin = divisor.origin
-        labels = () if origin is None or origin.span is None else (Label(origin.span, "from here"),)
+        labels = () if origin is None or origin.span is None else (origin.span.label("from here"),)
         amount = "0" if divisor.unit.dimensionless else f"0 {divisor.unit}"
         scope.fail(Diagnostic("E401", f"{what} by zero", place, f"is {amount}", labels))
     reach = bounds(divisor.num, scope.ranges)
@@ -615,7 +614,7 @@ def _mismatch(left: Number, right: Number, what: str, span: Span) -> Diagnostic:
     preposition = {"add": "and", "subtract": "and", "take the modulo of": "and"}.get(what, "with")
     verb = f"cannot {what}" if not what.startswith("`") else f"{what} cannot combine"
     labels = tuple(
-        Label(side.span, f"[{side.unit}]" + ("" if side.origin is None else f", {side.origin.text}"))
+        side.span.label(f"[{side.unit}]" + ("" if side.origin is None else f", {side.origin.text}"))
         for side in (left, right)
         if side.span is not None and side.span != span
     )

@@ -13,7 +13,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.normal_form import condition
 from stlc.compile.ir.traverse import is_state
-from stlc.diagnostics import Diagnostic, Label
+from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.signature import Column
 from stlc.source import Span
@@ -146,7 +146,7 @@ def member_number(member: Member, span: Span, scope: Scope) -> Number:
 
 
 def _number_for_formula(value: Value, expr: ast.Expr, need: Expectation) -> Diagnostic:
-    labels = () if need.span is None else (Label(need.span, "wants something that is true or false"),)
+    labels = () if need.span is None else (need.span.label("wants something that is true or false"),)
     message = f"{need.who} needs a formula, {need.which} is {noun(value)}"
     return Diagnostic("E201", message, expr.span, describe(value), labels, help=_as_comparison(value, expr))
 

@@ -26,7 +26,7 @@ from stlc.compile.frontend.scope import (
 from stlc.compile.frontend.tags import refuse_tags, require_between
 from stlc.compile.frontend.values import Number, TimeExpr, Value, VectorValue
 from stlc.compile.ir.functions import FUNCTIONS, callable_names, sampler_names
-from stlc.diagnostics import Diagnostic, Label
+from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.grammar.words import BUILT_IN
 from stlc.registry import closest, did_you_mean
@@ -219,7 +219,7 @@ def _matched(column: Column, decl: ast.Signal | ast.Param, interface: Interface,
         scope.fail(_absent_signal(column, decl, interface))
     own = interface.signature[column.name]
     place = interface.places.get(column.name)
-    labels = () if place is None else (Label(place, "declared here"),)
+    labels = () if place is None else (place.label("declared here"),)
     if column.unit.text and own.unit.text and not column.unit.same_dims(own.unit):
         message = f"`{column.name}` is in [{column.unit}] here and in [{own.unit}] in {interface.where}"
         scope.fail(Diagnostic("E203", message, decl.name_span, f"[{column.unit}]", labels))
@@ -445,7 +445,7 @@ def _claim(name: str, span: Span, enum: str, space: dict[str, tuple[Span, str]],
     first, owner = space[name]
     if enum and owner and enum != owner:
         return
-    labels = (Label(first, "first definition" if not owner else f"a member of `{owner}`"),)
+    labels = (first.label("first definition" if not owner else f"a member of `{owner}`"),)
     help_ = (f"rename one, or delete line {span.line}",)
     scope.report(
         Diagnostic("E102", f"`{name}` is defined twice", span, "second definition", labels, help=help_)

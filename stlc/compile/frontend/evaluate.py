@@ -40,7 +40,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.functions import OPERATORS as ARITHMETIC
 from stlc.compile.ir.traverse import is_state
-from stlc.diagnostics import Diagnostic, Label
+from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
 from stlc.grammar.traverse import children, descendants
@@ -473,7 +473,7 @@ def _traced(entry: Definition, call: ast.Call, scope: Scope) -> Iterator[None]:
     try:
         yield
     except Failed:
-        label = Label(call.span, f"in this use of `{entry.name}`")
+        label = call.span.label(f"in this use of `{entry.name}`")
         scope.sink[before:] = [
             finding
             if finding.labels and finding.labels[-1] == label

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from stlc.compile.frontend.scope import Scope
 from stlc.compile.frontend.values import Number, Operand, TimeExpr, Value, noun
 from stlc.compile.ir import typed
-from stlc.diagnostics import Diagnostic, Fix, Label
+from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar import ast
 from stlc.grammar.words import OPERATORS, UNARY_TEMPORAL
 from stlc.source import Span
@@ -133,7 +133,7 @@ def _not_constant(expr: ast.Expr, value: Number, scope: Scope) -> Diagnostic:
     labels = (
         ()
         if value.origin is None or value.origin.span is None
-        else (Label(value.origin.span, "declared here"),)
+        else (value.origin.span.label("declared here"),)
     )
     return Diagnostic(
         "E303",

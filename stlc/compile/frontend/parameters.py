@@ -17,7 +17,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.ranges import usual_range
 from stlc.compile.ir.support import columns_in
-from stlc.diagnostics import Diagnostic, Label, SpecError, UsageError, usage
+from stlc.diagnostics import Diagnostic, SpecError, UsageError, usage
 from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
 from stlc.registry import did_you_mean
@@ -183,7 +183,7 @@ def _agree(decl: ast.Param, columns: Sequence[Column], interface: Interface, sco
     a range and the ranges differ.
     """
     place = interface.places.get(columns[0].name)
-    labels = () if place is None else (Label(place, "declared here"),)
+    labels = () if place is None else (place.label("declared here"),)
     if not isinstance(decl.domain, tuple | ast.SetLiteral):
         message = f"{interface.where} says how `{decl.name}` is drawn, and so does this"
         help_ = (f"say it once: here `env signal {decl.name}`, or take it out of {interface.where}",)

@@ -29,7 +29,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.functions import Bounds
 from stlc.compile.ir.warnings import contradictions, safety_never_violated, vacuous
-from stlc.diagnostics import Diagnostic, Findings, Label, SpecError
+from stlc.diagnostics import Diagnostic, Findings, SpecError
 from stlc.grammar import ast
 from stlc.grammar.parser import MAX_ERRORS
 from stlc.signature import Column, Signature
@@ -119,7 +119,7 @@ def _check_same(column: Column, place: Span, known: Column, span: Span, scope: S
     if column.kind == known.kind and column.labels == known.labels and units:
         return
     message = f"`{column.name}` is declared differently in two files"
-    scope.report(Diagnostic("E104", message, place, labels=(Label(span, "and here"),)))
+    scope.report(Diagnostic("E104", message, place, labels=(span.label("and here"),)))
 
 
 def with_ranges(file: File, ranges: Mapping[str, Bounds]) -> File:
@@ -282,7 +282,7 @@ def _compare(item: ast.Const, value: Number, interface: Interface, scope: Scope)
     if math.isclose(ours, theirs, rel_tol=1e-9) and (free or value.unit.same_dims(unit)):
         return
     place = interface.places.get(item.name)
-    labels = () if place is None else (Label(place, "declared here"),)
+    labels = () if place is None else (place.label("declared here"),)
     here = _amount(value.constant / value.unit.scale, str(value.unit) if value.unit.text else "")
     there = _amount(unit.of_si(theirs), unit.text)
     message = f"`{item.name}` is {here} here and {there} in {interface.where}"

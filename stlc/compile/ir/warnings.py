@@ -11,7 +11,7 @@ from stlc.compile.ir import typed
 from stlc.compile.ir.normal_form import Sign, normal
 from stlc.compile.ir.ranges import KnownRanges, bounds
 from stlc.compile.ir.traverse import leaves, nodes, numbers, subexpressions
-from stlc.diagnostics import Diagnostic, Label
+from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.signature import Signature
 from stlc.source import Span
@@ -122,7 +122,7 @@ def _decided(node: typed.Logic, whole: Set[str]) -> Diagnostic | None:
             code,
             message,
             node.span,
-            labels=tuple(map(Label, places, texts)) if len(places) > 1 else (),
+            labels=tuple(map(Span.label, places, texts)) if len(places) > 1 else (),
             help=(f"{advice}, or the other comparison?",),
         )
     return None
@@ -312,7 +312,7 @@ def safety_never_violated(requirement: typed.Requirement, tag: ast.Tag | None) -
     if "safety" not in requirement.tags or _constrains(formula):
         return None
     culprit = _promise(formula)
-    labels = () if tag is None else (Label(tag.span, "puts it into phi_safe"),)
+    labels = () if tag is None else (tag.span.label("puts it into phi_safe"),)
     return Diagnostic(
         "W502",
         "this `@safety` requirement can never constrain the backup policy",

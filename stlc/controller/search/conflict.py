@@ -27,7 +27,7 @@ from stlc.controller.search.feasibility import TARGET, solve
 from stlc.controller.search.local_search import SearchResult
 from stlc.controller.search.missed import better_planner, missed
 from stlc.controller.search.planner import PlanBudget, plan
-from stlc.diagnostics import Diagnostic, Label
+from stlc.diagnostics import Diagnostic
 from stlc.native import Stop, never
 
 STARTS = 64
@@ -131,7 +131,7 @@ def _told(
         message,
         core[0].span,
         label=label,
-        labels=tuple(Label(rule.span, "with this") for rule in core[1:] if rule.span is not None),
+        labels=tuple(rule.span.label("with this") for rule in core[1:] if rule.span is not None),
         help=(
             "ask for less, give it more time (`horizon`) or wider ranges of control, or other initial states",
             "`stlc compile` shows what is asked for in steps",

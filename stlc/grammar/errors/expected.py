@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from stlc.diagnostics import Diagnostic, Fix, Label
+from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar.errors.failure import ParseFailure
 from stlc.grammar.errors.units import unit_advice
 from stlc.grammar.scan import CLOSES, Lexeme, brackets, closes
 from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, OPERATORS, RESERVED, ROLES, UNARY_TEMPORAL
 from stlc.registry import closest, did_you_mean
-from stlc.source import Span
+from stlc.source import Label, Span
 from stlc.units import Unit
 
 MAX_WORDS = 4
@@ -164,7 +164,7 @@ def stray_bracket(failure: ParseFailure) -> Diagnostic | None:
         "E010",
         f"this `{found.text}` does not close `{bracket.opening.text}`",
         failure.of(found),
-        labels=(Label(failure.of(bracket.opening), "opened here"),),
+        labels=(failure.of(bracket.opening).label("opened here"),),
     )
 
 
@@ -317,7 +317,7 @@ def _labels(failure: ParseFailure) -> tuple[Label, ...]:
     name = _declared(failure)
     if name is None or name[0] != failure.previous:
         return ()
-    return (Label(failure.of(name[0]), f"the {name[1]}'s name"),)
+    return (failure.of(name[0]).label(f"the {name[1]}'s name"),)
 
 
 def _found(failure: ParseFailure) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from stlc.diagnostics import Diagnostic, Fix, Label
+from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar.errors.expected import (
     expected,
     misspelt_operator,
@@ -110,9 +110,8 @@ def _unclosed(failure: ParseFailure) -> Diagnostic | None:
     if failure.found is not None or not failure.open_brackets:
         return None
     opening = failure.open_brackets[-1].opening
-    labels: tuple[Label, ...] = ()
-    if failure.follower is not None:
-        labels = (Label(failure.of(failure.follower), "the next declaration starts here"),)
+    next_ = failure.follower
+    labels = () if next_ is None else (failure.of(next_).label("the next declaration starts here"),)
     note: tuple[str, ...] = ()
     for inner in brackets(failure.before):
         same = inner.opening.text == opening.text and inner.opening.start > opening.start
@@ -145,7 +144,7 @@ def _chain(failure: ParseFailure) -> Diagnostic | None:
         "E012",
         f"`{_operator(found)}` does not chain; say which one is inside",
         failure.of(found),
-        labels=(Label(failure.of(failure.lexemes[first]), f"first `{_operator(failure.lexemes[first])}`"),),
+        labels=(failure.of(failure.lexemes[first]).label(f"first `{_operator(failure.lexemes[first])}`"),),
         help=(f"{left} ({right})     or     ({head}) {tail}",),
     )
 
@@ -224,7 +223,7 @@ def _vector_read_as_interval(failure: ParseFailure, bracket: Bracket, found: Lex
         f"`[` after `{operator.text}` starts a time interval",
         read,
         f"read as the interval from {bounds}",
-        (Label(rest, "so this has no left-hand side"),),
+        (rest.label("so this has no left-hand side"),),
         help=(f"{operator.text} ({read.text} {rest.text})     or name it:  def p = {read.text}",),
     )
 

@@ -14,7 +14,6 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.traverse import margin_unit
 from stlc.compile.pipeline import CompiledRequirement
-from stlc.diagnostics import Label
 from stlc.grammar import ast
 from stlc.jsontext import Num
 from stlc.monitor.explain.causes import CauseFinder, CauseNode, Violations
@@ -23,7 +22,7 @@ from stlc.monitor.judgement import RequirementVerdict, Verdict
 from stlc.monitor.prepared import Part, Prepared, Timeline
 from stlc.monitor.values import Record
 from stlc.signature import Column
-from stlc.source import Span
+from stlc.source import Label, Span
 
 _MOST_LABELS = 6
 
@@ -322,7 +321,7 @@ class _Words:
         for span, node in self.stated(tree):
             found.setdefault(span, self.label(node))
         first, *rest = found
-        return [Label(span, found[span]) for span in (first, *sorted(rest, key=lambda span: span.start))]
+        return [span.label(found[span]) for span in (first, *sorted(rest, key=lambda span: span.start))]
 
     def stated(
         self, node: CauseNode, use: Span | None = None, whole: CauseNode | None = None

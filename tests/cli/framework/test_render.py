@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stlc.cli.framework.render import MAX_COLUMNS, render_text
-from stlc.diagnostics import Diagnostic, Fix, Label
+from stlc.diagnostics import Diagnostic, Fix
 from stlc.jsontext import plain
 from stlc.source import Source, Span
 
@@ -32,7 +32,7 @@ def shown(*diagnostics: Diagnostic) -> str:
 
 def test_places_in_several_lines():
     finding = Diagnostic(
-        "E401", "modulo by zero", at("T_total", nth=1), "is 0 s", (Label(at("0 s"), "from here"),)
+        "E401", "modulo by zero", at("T_total", nth=1), "is 0 s", (at("0 s").label("from here"),)
     )
     assert shown(finding) == dedent("""\
         error[E401]: modulo by zero
@@ -54,7 +54,7 @@ def test_places_in_one_line_and_all_advice():
         "cannot compare [m] with [m/s]",
         at("<", source),
         "",
-        (Label(at("x", source), "[m], line 5"), Label(at("v", source), "[m/s], line 6")),
+        (at("x", source).label("[m], line 5"), at("v", source).label("[m/s], line 6")),
         help=("a time is missing:\n`x < v * 1 s`", "or drop the units"),
         note=("why",),
         fix=Fix(((at("v", source), "v * 1 s"),), "multiply by 1 s"),
@@ -89,7 +89,7 @@ def test_several_findings_have_an_empty_line_between_them():
 
 def test_another_file():
     system = Source("car.yaml", "time:\n  dt: 0.1 s\n")
-    finding = Diagnostic("E104", "differs", at("0 s"), labels=(Label(at("0.1 s", system), "here"),))
+    finding = Diagnostic("E104", "differs", at("0 s"), labels=(at("0.1 s", system).label("here"),))
     assert shown(finding).splitlines()[1:] == [
         " --> specs/traffic.stl:2:17",
         "  |",
@@ -127,7 +127,7 @@ def test_tabs_wide_characters_and_controls(line, piece, expanded, indent, width)
 def test_no_text_of_a_file_steers_the_terminal():
     source = Source("\x1b[2J.stl", "\x9b31m x")
     finding = Diagnostic(
-        "E001", "a\x07b", source.span(0, 1), "\x1b", (Label(source.span(5, 6), "\r"),), ("\x08",)
+        "E001", "a\x07b", source.span(0, 1), "\x1b", (source.span(5, 6).label("\r"),), ("\x08",)
     )
     text = shown(finding)
     assert not re.search(r"[\x00-\x09\x0b-\x1f\x7f-\x9f]", text)
@@ -162,7 +162,7 @@ def test_a_long_line_is_cut_around_the_place():
 
 def test_colours_change_nothing_but_the_colour():
     finding = Diagnostic(
-        "E401", "zero", at("T_total", nth=1), "is 0", (Label(at("0 s"), "from"),), ("h",), ("n",)
+        "E401", "zero", at("T_total", nth=1), "is 0", (at("0 s").label("from"),), ("h",), ("n",)
     )
     colored = render_text([finding], color=True)
     assert "\x1b[1;31merror[E401]\x1b[0m" in colored
@@ -177,7 +177,7 @@ def test_json():
         "off the grid",
         at("0 s"),
         "here",
-        (Label(at("tau"), "there"),),
+        (at("tau").label("there"),),
         ("do",),
         ("because",),
         Fix(((at("0 s"), "1 s"),), "round"),
@@ -215,7 +215,7 @@ def test_every_text_and_place_can_be_shown(text, data):
     for _ in range(3):
         start = data.draw(st.integers(0, len(text)))
         spans.append(source.span(start, data.draw(st.integers(start, len(text)))))
-    finding = Diagnostic("E001", "m", spans[0], "p", tuple(Label(span, "s") for span in spans[1:]))
+    finding = Diagnostic("E001", "m", spans[0], "p", tuple(span.label("s") for span in spans[1:]))
     rows = shown(finding).splitlines()
     assert sum("^" in row and row.endswith(" p") for row in rows) >= 1
     assert json.dumps(plain(finding))

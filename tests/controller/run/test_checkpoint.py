@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from stlc import rundir
 from stlc.controller.run.checkpoint import (
     load_checkpoint,
     never_saved,
@@ -21,6 +20,7 @@ from stlc.controller.run.checkpoint import (
 )
 from stlc.controller.run.run import load_config
 from stlc.diagnostics import MissingError, PluginError, RunError
+from stlc.files import File
 from stlc.provenance import sha256
 from stlc.rundir import RunDir
 
@@ -82,15 +82,15 @@ def test_a_full_disk_at_any_moment_keeps_the_last_good_one(
 def test_a_second_save_at_one_step_keeps_the_first_until_it_is_whole(
     run: RunDir, monkeypatch: pytest.MonkeyPatch, files: int
 ) -> None:
-    real, written = rundir.write_atomic, itertools.count()
+    real, written = File.write, itertools.count()
 
-    def killed(path: Path, data: bytes | str) -> None:
+    def killed(file: File, data: bytes | str) -> None:
         if next(written) >= files:
             raise KeyboardInterrupt
-        real(path, data)
+        real(file, data)
 
     with monkeypatch.context() as patch:
-        patch.setattr(rundir, "write_atomic", killed)
+        patch.setattr(File, "write", killed)
         with pytest.raises(KeyboardInterrupt):
             save_checkpoint(run, {"w": torch.zeros(1)}, HASHES, step=1)
     assert _value(run) == [0.0, 1.0, 2.0]

@@ -11,7 +11,7 @@ from typing import ClassVar, Literal, TypeAlias
 from stlc.compile.frontend.scope import Entry, Known, Scope, enforced
 from stlc.compile.frontend.values import Number, VectorValue
 from stlc.compile.ir import nodes as ir
-from stlc.diagnostics import Label, SystemFileError
+from stlc.diagnostics import SystemFileError
 from stlc.dynamics.declaration.schema.expressions import SECOND, Expressions
 from stlc.dynamics.declaration.schema.reader import Reader
 from stlc.dynamics.declaration.schema.yaml_nodes import Scalar
@@ -139,7 +139,7 @@ class Names:
         first = self.places.get(key.text)
         if first is not None:
             message, advice = f"`{key.text}` is declared twice", "rename one of the two"
-            labels = (Label(first, "declared first"),)
+            labels = (first.label("declared first"),)
             reader.report("E102", message, key.span, advice, label=f"{what} here", labels=labels)
             return False
         if not key.text.isidentifier() or key.text == "dt":

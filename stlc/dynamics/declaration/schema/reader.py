@@ -6,11 +6,11 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from stlc.diagnostics import Diagnostic, Findings, Label, SystemFileError, tell
+from stlc.diagnostics import Diagnostic, Findings, SystemFileError, tell
 from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence
 from stlc.escape import unseen
 from stlc.registry import did_you_mean
-from stlc.source import Source, Span
+from stlc.source import Label, Source, Span
 
 V = TypeVar("V")
 MAX_NAME = 200

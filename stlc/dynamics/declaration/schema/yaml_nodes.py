@@ -17,8 +17,8 @@ from typing import Any, Literal, TypeAlias
 
 import yaml
 
-from stlc.diagnostics import Diagnostic, Label, SystemFileError
-from stlc.source import Source, Span
+from stlc.diagnostics import Diagnostic, SystemFileError
+from stlc.source import Label, Source, Span
 
 MAX_DEPTH = 40
 MAX_NODES = 20_000
@@ -203,7 +203,7 @@ def _syntax(source: Source, error: yaml.MarkedYAMLError) -> Diagnostic:
     labels: tuple[Label, ...] = ()
     if error.context and error.context_mark and error.context_mark.index < offset:
         start = error.context_mark.index
-        labels = (Label(source.span(start, start + 1), error.context),)
+        labels = (source.span(start, start + 1).label(error.context),)
     problem = error.problem or error.context or "cannot be read"
     for ugly, plain in _PLAIN_WORDS:
         problem = problem.replace(ugly, plain)
@@ -214,7 +214,7 @@ def _syntax(source: Source, error: yaml.MarkedYAMLError) -> Diagnostic:
     if "block end" in (error.problem or "") and indent != column - 1:
         start = source.line_starts[above - 1] + indent
         said = f"indented by {indent}, the line below by {column - 1}"
-        labels = (Label(source.span(start, start + 1), said),)
+        labels = (source.span(start, start + 1).label(said),)
         problem = "two neighbouring lines are indented differently"
         helps = ("keys of one mapping start in one column; keys below a key, farther right",)
     return Diagnostic(
@@ -351,7 +351,7 @@ class _Builder:
                 f"the key `{key.text}` is given twice",
                 key.span,
                 label="given again",
-                labels=(Label(first.span, "given first"),),
+                labels=(first.span.label("given first"),),
                 help=("remove one of the two",),
             )
         )
