@@ -32,7 +32,7 @@ from stlc.controller.guard.margins import AUTO, MarginRequest, parse_margins
 from stlc.controller.run.run import Run
 from stlc.controller.search.feasibility import viable
 from stlc.controller.world import world_type
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import usage
 from stlc.dynamics.declaration.deployment import ErrorsDecl
 from stlc.dynamics.scenario import DISTURBED
 from stlc.jsontext import plain
@@ -99,7 +99,7 @@ class DeploymentOptions:
         if not found:
             help_ = ("python -m benchmarks paper  trains them", "or name runs")
             message = f"there are no policies of the benchmarks in `{self.runs_folder}`"
-            raise UsageError(Diagnostic("U101", message, help=help_))
+            raise usage(message, *help_)
         return found
 
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from stlc.diagnostics import Diagnostic, StlcError, UsageError
+from stlc.diagnostics import StlcError, usage
 from stlc.files import File
 from stlc.grammar.parser import parse
 from stlc.provenance import sha256
@@ -72,7 +72,7 @@ def tasks_in(folder: Path) -> tuple[ControlTask, ...]:
             for each in specs
         ]
     if not found:
-        raise UsageError(Diagnostic("U102", f"there is no task in a folder of `{folder}`"))
+        raise usage(f"there is no task in a folder of `{folder}`", code="U102")
     return tuple(found)
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stlc.cli.framework.options import JsonOption
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import usage
 from stlc.options import parse_clock, parse_seconds, parse_seeds
 from stlc.registry import closest
 
@@ -96,7 +96,7 @@ class Training:
         from benchmarks.training import Length
 
         if self.budget and self.steps is not None:
-            raise UsageError(Diagnostic("U101", "`--budget` and `--steps` contradict each other"))
+            raise usage("`--budget` and `--steps` contradict each other")
         clock = parse_clock(self.clock)
         seconds = [parse_seconds(text) for text in dict.fromkeys(self.budget or ())] or usual
         lengths = [Length(each, clock=clock) for each in seconds]
@@ -218,9 +218,9 @@ def chosen(text: str | None, known: Sequence[str], what: str) -> tuple[str, ...]
         if name not in known:
             near = closest(name, known)
             help_ = (f"did you mean `{near}`?",) if near else (", ".join(known),)
-            raise UsageError(Diagnostic("U101", f"there is no {what} `{name}`", help=help_))
+            raise usage(f"there is no {what} `{name}`", *help_)
     if not names:
-        raise UsageError(Diagnostic("U101", f"no {what} is named", help=(", ".join(known),)))
+        raise usage(f"no {what} is named", ", ".join(known))
     return names
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from stlc.compile.frontend.modules import library_of
 from stlc.controller.problem.task import Task
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import usage
 from stlc.dynamics.system import System
 from stlc.files import File, alone_in
 from stlc.grammar.parser import parse
@@ -100,9 +100,7 @@ class ResultStore:
             return dict(document["results"])
         except (OSError, ValueError, LookupError, TypeError) as error:
             message = f"the results in `{self.path}` cannot be read: {error}"
-            raise UsageError(
-                Diagnostic("U102", message, help=("move the file away, or repair it",))
-            ) from None
+            raise usage(message, "move the file away, or repair it", code="U102") from None
 
 
 def made_here() -> dict[str, Any]:
@@ -123,7 +121,7 @@ def spec_path(benchmark: str) -> Path:
     for path in (folder / part / name for folder in (Path("specs"), File.SPECS) for part in ("", "families")):
         if path.is_file():
             return path
-    raise UsageError(Diagnostic("U102", f"there is no benchmark `{benchmark}`", help=BENCHMARKS))
+    raise usage(f"there is no benchmark `{benchmark}`", *BENCHMARKS, code="U102")
 
 
 def load(benchmark: str, overrides: tuple[tuple[str, str], ...] = ()) -> Task:
@@ -135,7 +133,7 @@ def load(benchmark: str, overrides: tuple[tuple[str, str], ...] = ()) -> Task:
 def _load(_where: Path, path: Path, overrides: tuple[tuple[str, str], ...]) -> Task:
     spec = parse(File(path).read())
     if spec.system is None:
-        raise UsageError(Diagnostic("U101", f"`{path}` names no system"))
+        raise usage(f"`{path}` names no system")
     changed = dict(overrides)
     system = System.load(File(spec.system).system(path), changed)
     return Task.of(spec, system, overrides=changed)

@@ -194,9 +194,14 @@ class UsageError(StlcError):
     exit_code = 2
 
 
-def usage(message: str, *advice: str) -> UsageError:
-    """Return the error U101 (wrong command line) with a message and advice; the caller raises it."""
-    return UsageError.of("U101", message, help=advice)
+def usage(
+    message: str, *advice: str, code: str = "U101", span: Span | None = None, note: tuple[str, ...] = ()
+) -> UsageError:
+    """Return an error of what the user asks for, with a message and advice; the caller raises it.
+
+    Its code is U101, a wrong command line or argument, unless `code` says otherwise.
+    """
+    return UsageError.of(code, message, span, help=advice, note=note)
 
 
 class MissingError(StlcError):

@@ -66,11 +66,11 @@ class File:
         except FileNotFoundError:
             near = closest(path.name, _siblings(path.parent))
             advice = (f"did you mean `{path.parent / near}`?",) if near else ()
-            raise UsageError.of("U102", f"there is no file `{path}`", help=advice) from None
+            raise usage(f"there is no file `{path}`", *advice, code="U102") from None
         except OSError as error:
             raise (_too_large(name) if error.errno == errno.EFBIG else unreadable(path, error)) from None
         except ValueError:  # a zero byte in the name
-            raise UsageError.of("U102", f"no file can be called {name!r}") from None
+            raise usage(f"no file can be called {name!r}", code="U102") from None
         return decoded(name, data, root)
 
     def opened(self) -> BinaryIO:
@@ -230,7 +230,7 @@ class File:
                 return File(path).of_run()
         if Path(name).is_dir():
             advice = f"name its traces: '{Path(name) / '*'}'"
-            raise UsageError.of("U102", f"`{name}` is a folder, not a trace", help=(advice,))
+            raise usage(f"`{name}` is a folder, not a trace", advice, code="U102")
         raise UsageError(_no_such("trace", name, folders))
 
     def seen(self, runs: Path = Path("runs")) -> Path:
@@ -260,7 +260,7 @@ class File:
                 path for path in start.glob(str(Path(*rest))) if not _hidden(path.relative_to(start), rest)
             ]
         except OSError as error:
-            raise UsageError.of("U102", f"cannot look up `{pattern}`: {os_reason(error)}") from None
+            raise usage(f"cannot look up `{pattern}`: {os_reason(error)}", code="U102") from None
         found = {path for path in paths if path.is_file() or _is_bag(path)}
         bags = {path for path in found if path.is_dir()}
         names = sorted(str(path) for path in found if bags.isdisjoint(path.parents))
@@ -268,7 +268,7 @@ class File:
             advice = (
                 () if "**" in parts else ("`**` stands for any number of folders, as in 'logs/**/*.csv'",)
             )
-            raise UsageError.of("U102", f"no file matches `{pattern}`", help=advice)
+            raise usage(f"no file matches `{pattern}`", *advice, code="U102")
         return names
 
     def of_run(self) -> Path:
@@ -298,7 +298,7 @@ def _noun(mode: int) -> str:
 def unreadable(path: Path, error: OSError) -> UsageError:
     """Return the error U102 for a file that cannot be read."""
     advice = ("`-` stands for the standard input",) if error.errno == errno.EINVAL else ()
-    return UsageError.of("U102", f"cannot read `{path}`: {os_reason(error)}", help=advice)
+    return usage(f"cannot read `{path}`: {os_reason(error)}", *advice, code="U102")
 
 
 def _too_large(name: str) -> SpecError:
@@ -395,7 +395,7 @@ def _specs_below(name: str) -> Iterator[str]:
         and not any(part.startswith(".") for part in path.relative_to(folder).parts)  # hidden
     )
     if not found:
-        raise UsageError.of("U102", f"there is no specification in `{name}`")
+        raise usage(f"there is no specification in `{name}`", code="U102")
     yield from map(str, found)
 
 

@@ -28,7 +28,6 @@ from stlc.toolchain import (
     TooMuchError,
     compiled,
     compiler,
-    failure,
     remember,
     trouble,
     version,
@@ -216,7 +215,7 @@ def _attempted(using: str, source: Path, target: Path, level: str) -> str:
         done = compiled(using, [level, *FLAGS, str(source), "-o", str(target), *attempt, "-lm"])
         if done.code == 0 and target.is_file():
             return ""
-    return failure(done)
+    return done.failure
 
 
 def _processor() -> str:

@@ -91,47 +91,6 @@ class Option:
         return (option and option.flags) or (f"--{name.rstrip('_').replace('_', '-')}",)
 
 
-def taking(
-    options: Callable[P, Chosen],
-) -> Callable[[Callable[[Subject, Chosen], Result]], Callable[Concatenate[Subject, P], Result]]:
-    """Return a decorator: a function of a subject and `options` takes their fields as keyword arguments.
-
-    A path may be given as text.
-    """
-
-    def decorate(function: Callable[[Subject, Chosen], Result]) -> Callable[Concatenate[Subject, P], Result]:
-        own, hints = inspect.signature(function), get_type_hints(options)
-        paths = {name for name, hint in hints.items() if Path in (hint, *get_args(hint))}
-
-        @wraps(function)
-        def called(subject: Subject, *given: P.args, **named: P.kwargs) -> Result:
-            for name in paths & named.keys():
-                if isinstance(text := named[name], str):
-                    named[name] = Path(text)
-            return function(subject, options(*given, **named))
-
-        first, *_ = own.parameters.values()
-        taken = inspect.signature(options).parameters
-        rest = (each.replace(annotation=hints[name]) for name, each in taken.items())
-        called.__signature__ = own.replace(parameters=[first, *rest])  # type: ignore[attr-defined]
-        return called  # type: ignore[return-value]
-
-    return decorate
-
-
-def require_no_jobs(cluster: str | None, jobs: int) -> None:
-    """Raise UsageError (U101) if `--cluster` and `--jobs` are both given."""
-    if cluster is not None and jobs != 1:
-        raise usage("`--jobs` and `--cluster` contradict each other", "a cluster uses all of its cores")
-
-
-def checked_share(option: str, share: float) -> float:
-    """Return a share between 0 and 1, the value of `option`; any other number raises UsageError (U101)."""
-    if not 0.0 < share < 1.0:
-        raise usage(f"`{option} {share:g}` is not between 0 and 1", f"{option} .99")
-    return share
-
-
 def parse_overrides(pairs: Sequence[str] | None) -> dict[str, str]:
     """Parse pairs such as `T_red=3 s` into a mapping such as `{"T_red": "3 s"}`.
 
@@ -262,6 +221,49 @@ class Options:
     ]
     Runs = Annotated[Path, Option("Folder of all runs.", "DIR")]
     Python = Annotated[bool, Option("Run the Python that the run names: of a run that you trust.")]
+
+    @staticmethod
+    def taking(
+        options: Callable[P, Chosen],
+    ) -> Callable[[Callable[[Subject, Chosen], Result]], Callable[Concatenate[Subject, P], Result]]:
+        """Return a decorator: a function of a subject and `options` takes their fields as keyword arguments.
+
+        A path may be given as text.
+        """
+
+        def decorate(
+            function: Callable[[Subject, Chosen], Result],
+        ) -> Callable[Concatenate[Subject, P], Result]:
+            own, hints = inspect.signature(function), get_type_hints(options)
+            paths = {name for name, hint in hints.items() if Path in (hint, *get_args(hint))}
+
+            @wraps(function)
+            def called(subject: Subject, *given: P.args, **named: P.kwargs) -> Result:
+                for name in paths & named.keys():
+                    if isinstance(text := named[name], str):
+                        named[name] = Path(text)
+                return function(subject, options(*given, **named))
+
+            first, *_ = own.parameters.values()
+            taken = inspect.signature(options).parameters
+            rest = (each.replace(annotation=hints[name]) for name, each in taken.items())
+            called.__signature__ = own.replace(parameters=[first, *rest])  # type: ignore[attr-defined]
+            return called  # type: ignore[return-value]
+
+        return decorate
+
+    @staticmethod
+    def checked_share(option: str, share: float) -> float:
+        """Return a share in (0, 1), the value of `option`; any other number raises UsageError (U101)."""
+        if not 0.0 < share < 1.0:
+            raise usage(f"`{option} {share:g}` is not between 0 and 1", f"{option} .99")
+        return share
+
+    @staticmethod
+    def require_no_jobs(cluster: str | None, jobs: int) -> None:
+        """Raise UsageError (U101) if `--cluster` and `--jobs` are both given."""
+        if cluster is not None and jobs != 1:
+            raise usage("`--jobs` and `--cluster` contradict each other", "a cluster uses all of its cores")
 
     def given(self) -> dict[str, Any]:
         """Keyword arguments that give these options."""

@@ -19,7 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from stlc.diagnostics import PluginError, StlcError, UsageError
+from stlc.diagnostics import PluginError, StlcError, usage
 
 PREFIX = "stlc."
 """Beginning of the names of groups of entry points."""
@@ -96,7 +96,7 @@ def name_path(group: str, path: Path) -> str:
         UsageError: U102, there is no such file.
     """
     if not path.exists():
-        raise UsageError.of("U102", f"there is no file `{path}`")
+        raise usage(f"there is no file `{path}`", code="U102")
     before = [each for each in os.environ.get(variable(group), "").split(os.pathsep) if each]
     os.environ[variable(group)] = os.pathsep.join(dict.fromkeys((*before, str(path.absolute()))))
     return path.stem

@@ -13,7 +13,7 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any, Generic, TypeVar
 
-from stlc.diagnostics import Diagnostic, UsageError, usage
+from stlc.diagnostics import usage
 from stlc.plugins import Plugin, name_path, plugins
 
 T = TypeVar("T")
@@ -101,8 +101,7 @@ class Registry(Generic[T]):
         if name in self._entries:
             return self._entries[name]
         if name not in self:
-            finding = Diagnostic("U101", f"unknown {self.kind} `{name}`", help=(self.suggest(name),))
-            raise UsageError(finding)
+            raise usage(f"unknown {self.kind} `{name}`", self.suggest(name))
         return self._entries[name]
 
     def suggest(self, name: str) -> str:

@@ -192,7 +192,7 @@ class RunDir:
         runs = sorted(RunDir.every(root), key=lambda run: run.path.stat().st_mtime)
         if not runs:
             help_ = ("train one: stlc train specs/traffic.stl --system car.yaml",)
-            raise UsageError.of("R101", f"there is no run in `{root}`", help=help_)
+            raise usage(f"there is no run in `{root}`", *help_, code="R101")
         return runs[-1]
 
     @classmethod
@@ -255,7 +255,7 @@ class RunDir:
             folder = cls.open(what, runs)
         if not folder.has(RunDir.TRACE):
             advice = (f"record one: {shell(('stlc', 'simulate', folder.name))}",)
-            raise UsageError.of("U102", f"`{folder.shown}` has no trace", help=advice)
+            raise usage(f"`{folder.shown}` has no trace", *advice, code="U102")
         folder.file(RunDir.TRACE, RunDir.MOST_ARRAYS)
         return Path(folder.shown) / RunDir.TRACE
 
@@ -500,10 +500,10 @@ def _by_name(where: str, root: Path) -> RunDir:
         return fitting[0]
     if fitting:
         choices = tuple(f"{run.path.parent.name}/{run.name}" for run in fitting)
-        raise UsageError.of("R101", f"several runs are called `{where}`", help=choices)
+        raise usage(f"several runs are called `{where}`", *choices, code="R101")
     names = {name for run in runs for name in (run.name, _names(run)[-1], run.path.parent.name)}
     advice = did_you_mean(where, names)
-    raise UsageError.of("R101", f"there is no run `{where}` in `{root}`", help=advice)
+    raise usage(f"there is no run `{where}` in `{root}`", *advice, code="R101")
 
 
 def _of_spec(path: Path, root: Path) -> RunDir:
@@ -519,7 +519,7 @@ def _of_spec(path: Path, root: Path) -> RunDir:
     found = trained or [run for run in runs if run.path.parent.name == _slug(path.stem)]
     if not found:
         help_ = (f"train one: {shell(('stlc', 'train', str(path)))}",)
-        raise UsageError.of("R101", f"there is no run of `{path}` in `{root}`", help=help_)
+        raise usage(f"there is no run of `{path}` in `{root}`", *help_, code="R101")
     return found[-1]
 
 

@@ -77,6 +77,13 @@ class ProgramResult:
     out: str
     errors: str
 
+    @property
+    def failure(self) -> str:
+        """Reason for a compiler's failure in one line: its exit code and first error message."""
+        lines = [line.strip() for line in (self.errors or self.out).splitlines() if line.strip()]
+        message = next((line for line in lines if "error" in line.lower()), lines[0] if lines else "")
+        return f"fails with exit code {self.code}" + (f": {message[:160]}" if message else "")
+
 
 def compiler() -> str | None:
     """Path of the system's C compiler: `$CC`, `cc`, `gcc` or `clang`; None if there is none."""
@@ -154,14 +161,7 @@ def works(using: str) -> str:
         return f"has no room to work: {(error.strerror or str(error)).lower()}"
     except CompilerError as error:
         return error.why
-    return "" if done.code == 0 else failure(done)
-
-
-def failure(done: ProgramResult) -> str:
-    """Reason for a compiler's failure in one line: its exit code and first error message."""
-    lines = [line.strip() for line in (done.errors or done.out).splitlines() if line.strip()]
-    message = next((line for line in lines if "error" in line.lower()), lines[0] if lines else "")
-    return f"fails with exit code {done.code}" + (f": {message[:160]}" if message else "")
+    return "" if done.code == 0 else done.failure
 
 
 # ---------------------------------------------------------------------- remembered

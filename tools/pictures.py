@@ -41,7 +41,7 @@ from stlc.controller.sketch import (
 )
 from stlc.files import File
 from stlc.rundir import RunDir
-from stlc.view.animation import Animation, clear_artists, frames_in, save_animation, save_still
+from stlc.view.animation import Animation, clear_artists, save_animation, save_still
 from stlc.view.run_animation import RecordedScene, animation_of, recorded_scene
 from stlc.view.style import INK, MUTED
 
@@ -111,7 +111,7 @@ def lead(runs: Path, folder: Path, seed: int | None = None) -> Iterator[Path]:
     path = folder / "guard.webp"
     animation = lead_animation(without, guarded)
     last = animation.frames - 1
-    pictures = list(frames_in(animation, [last, *range(last)], 100))
+    pictures = list(animation.images([last, *range(last)], 100))
     durations = [round(1000 * HELD), *[round(1000 * without.dt)] * last]
     for quality in range(80, 20, -8):
         buffer = io.BytesIO()

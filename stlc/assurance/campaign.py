@@ -13,15 +13,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Literal, Protocol
 
-from stlc.assurance.certificate import (
-    Assessment,
-    Claim,
-    Sample,
-    StoredStatement,
-    assess,
-    joined,
-    wrong_numbers,
-)
+from stlc.assurance.certificate import Assessment, Claim, Sample, StoredStatement, joined, wrong_numbers
 from stlc.assurance.conformal import parse_shift
 from stlc.diagnostics import usage
 from stlc.jsontext import Count
@@ -137,7 +129,7 @@ def campaign(order: Campaign) -> Iterator[Progress]:
             continue
         if not fixed and claim.calibration is None:  # the same units, however many follow
             claim = replace(claim, calibration=min(first, sum(part.count for part in parts)))
-        assessment = assess(replace(joined(parts), left_out=left_out), claim)
+        assessment = replace(joined(parts), left_out=left_out).assess(claim)
         if order.width is None:
             answered = assessment.answer in ("certified", "refuted")
         else:

@@ -141,6 +141,20 @@ class Sample:
         np.minimum.at(found, self.units, values)
         return found
 
+    def assess(self, claim: Claim) -> Assessment:
+        """Compute the bounds on future drives from at least one drive."""
+        sizes = self.sizes
+        return Assessment(
+            claim,
+            statement(self.overall, self, claim),
+            tuple(statement(each, self, claim) for each in self.requirements),
+            self.noun,
+            (int(sizes.min()), int(sizes.max())),
+            _online(self, claim) if claim.online else None,
+            min(self.count, claim.calibration or self.count),
+            self.left_out,
+        )
+
 
 def sample_of_traces(verdict: Verdict) -> Sample | None:
     """Sample of the traces to which a specification applies; None if there are none.
@@ -514,21 +528,6 @@ class JudgedFiles:
     verdict: Status
     files: tuple[Verdict | Unjudged, ...]
     assurance: Assessment | None = None
-
-
-def assess(sample: Sample, claim: Claim) -> Assessment:
-    """Compute the bounds on future drives from a sample of at least one drive."""
-    sizes = sample.sizes
-    return Assessment(
-        claim,
-        statement(sample.overall, sample, claim),
-        tuple(statement(each, sample, claim) for each in sample.requirements),
-        sample.noun,
-        (int(sizes.min()), int(sizes.max())),
-        _online(sample, claim) if claim.online else None,
-        min(sample.count, claim.calibration or sample.count),
-        sample.left_out,
-    )
 
 
 def _online(sample: Sample, claim: Claim) -> OnlineBound | None:

@@ -25,7 +25,7 @@ from stlc.escape import file_part
 from stlc.files import File
 from stlc.foreign import driving
 from stlc.jsontext import data_of, dumps, keys_below
-from stlc.options import checked_share, taking
+from stlc.options import Options
 from stlc.provenance import hardware, versions
 from stlc.records import read
 from stlc.registry import GUARDS
@@ -104,7 +104,7 @@ class BoundedDraws(Certificate):
     subject: CertifiedDraws
 
 
-@taking(CertifyOptions)
+@Options.taking(CertifyOptions)
 def certify(run: Run | Path | str | None, options: CertifyOptions) -> Certificate | CertificateCheck:
     """Certify that a share of all drives, or simulations, satisfies the requirements.
 
@@ -131,7 +131,7 @@ def certify(run: Run | Path | str | None, options: CertifyOptions) -> Certificat
         share = SHARE
     for option, value in {"share": share, "confidence": options.confidence, "width": options.width}.items():
         if value is not None:
-            checked_share(f"--{option}", value)
+            Options.checked_share(f"--{option}", value)
     claim = Claim(share, options.confidence, shift, online=True)
     subject, home, shown = _subject(name, options)
     seeds = None if options.seeds is None else tuple(options.seeds)

@@ -25,12 +25,12 @@ from stlc.assurance.falsified import (
 from stlc.assurance.falsify import SearchBudget, SearchOrder, falsify_each
 from stlc.assurance.options import FalsifyOptions
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.diagnostics import SpecError, UsageError, usage
+from stlc.diagnostics import SpecError, usage
 from stlc.escape import file_part
 from stlc.files import File
 from stlc.jsontext import data_of, dumps
 from stlc.monitor.judgement import require_known
-from stlc.options import MOST_SEED, require_no_jobs, taking
+from stlc.options import MOST_SEED, Options
 from stlc.plants.plant import PlantFinding
 from stlc.records import read
 from stlc.registry import GUARDS
@@ -54,7 +54,7 @@ MOST_WRITTEN = 10
 """Kinds of failures, by reason and message, that are written to files; the first of each kind."""
 
 
-@taking(FalsifyOptions)
+@Options.taking(FalsifyOptions)
 def falsify(
     target: Run | Path | str, options: FalsifyOptions
 ) -> FalsifiedSystem | ReplayedCounterexample | ReplayedFinding:
@@ -81,7 +81,7 @@ def falsify(
     if options.replay is not None:
         return _replayed(source, options.replay)
     File(options.out).require_folder()
-    require_no_jobs(options.cluster, options.jobs)
+    Options.require_no_jobs(options.cluster, options.jobs)
     simulator = source.load()
     names = simulator.requirements
     require_known(options.require, names)
@@ -324,7 +324,7 @@ def _stored(path: Path) -> StoredCounterexample | StoredFinding:
     except (SpecError, ValueError, RecursionError) as error:
         help_, why = ("a file that `stlc falsify` wrote",), str(error)[:200]
         message = f"`{path}` is not a counterexample"
-        raise UsageError.of("U101", message, help=help_, note=(why,)) from None
+        raise usage(message, *help_, note=(why,)) from None
     return stored
 
 

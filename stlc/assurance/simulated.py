@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeAlias
 
 from stlc.activity import PULSE
-from stlc.assurance.certificate import Assessment, Claim, assess
+from stlc.assurance.certificate import Assessment, Claim
 from stlc.assurance.drives import sample_of
 from stlc.assurance.options import SimulateOptions
 from stlc.controller.deployment.batched import Setting
@@ -33,7 +33,7 @@ from stlc.diagnostics import Diagnostic, RunError, notice, usage
 from stlc.dynamics.scenario import DISTURBED, find_scenario
 from stlc.dynamics.uncertainty.disturbance import errors_of
 from stlc.jsontext import Count
-from stlc.options import checked_share
+from stlc.options import Options
 from stlc.registry import GUARDS, PLANNERS
 from stlc.rundir import RunDir
 from stlc.trace import Trace
@@ -170,7 +170,7 @@ def simulation(
     if options.record is not None:
         Trace.check_writable(options.record)
     if options.certify is not None:
-        checked_share("--certify", options.certify)
+        Options.checked_share("--certify", options.certify)
     planner = _planner(options)
     beside = None
     if isinstance(subject, str | Path):
@@ -366,4 +366,4 @@ class _Order:
             why = "every drive violates an assumption of the specification"
             PULSE.tell(f"guard `{name}`: no bounds, as {why}")
             return None
-        return assess(sample, Claim(self.options.certify, online=True))
+        return sample.assess(Claim(self.options.certify, online=True))

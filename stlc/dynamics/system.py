@@ -30,7 +30,7 @@ from stlc.dynamics.model.feedback import unstable
 from stlc.dynamics.model.mirror import Mirror
 from stlc.dynamics.model.rollout import Columns, Stepper
 from stlc.dynamics.model.samplers import Drawing, InitialStates, Rows
-from stlc.dynamics.model.step import ModelStep, build_step, commands
+from stlc.dynamics.model.step import ModelStep, build_step
 from stlc.dynamics.scenario import truth, under
 from stlc.files import File
 from stlc.source import Source
@@ -273,7 +273,7 @@ class System:
 
     @cached_property
     def _commands(self) -> ArrayProgram | None:
-        found = commands(self.decl)
+        found = self.decl.commands
         return ArrayProgram(found) if found else None
 
     def rollout(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
@@ -467,7 +467,7 @@ class System:
         sum without terms is None.
         """
         sums: list[ir.Num | None] = [None, None]
-        given = commands(self.decl)
+        given = self.decl.commands
         for term in self.decl.objective.terms:
             if term.weight:
                 kind = bool(columns_in(term.value) & set(self.control_names))

@@ -35,7 +35,6 @@ from stlc.dynamics.declaration.learning import START
 from stlc.dynamics.declaration.schema.names import ControlDecl
 from stlc.dynamics.model.controls import SQUASHES, raw_width
 from stlc.dynamics.model.cost import REDUCED, CostTerm
-from stlc.dynamics.model.step import commands
 from stlc.escape import c_comment, c_string
 from stlc.export.description import control_images, observation, state_images
 from stlc.runtime.decision import TIE
@@ -197,7 +196,7 @@ def squashed(controls: Sequence[ControlDecl]) -> list[str]:
 
 def command(task: Task) -> list[str]:
     """C statements for the actuator command `command`, from the state `x` and a plan's first control `u`."""
-    names, given = task.system.control_names, commands(task.system.decl)
+    names, given = task.system.control_names, task.system.decl.commands
     places = {name: f"x[{i}]" for i, name in enumerate(task.system.names)}
     places |= {name: f"u[{i}]" for i, name in enumerate(names)}
     return _assigned("command", [given.get(name, ir.Signal(name)) for name in names], places)
@@ -296,7 +295,7 @@ def _numbers(task: Task, network: PlanProposer) -> dict[str, object]:
     most = max((grid.count(length) for length in grid.lengths), default=0)
     controls, names = task.system.decl.controls, task.system.control_names
     states, inputs = _places("x", task.system.names), _places("u", names)
-    given = commands(task.system.decl)
+    given = task.system.decl.commands
     commanded = [given.get(name, ir.Signal(name)) for name in names]
     return {
         "NAME": c_comment(task.system.decl.name),

@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Literal
 
 from stlc.compile.backends.c.streams import TABLES, Streams, runtime, streams_of
 from stlc.compile.backends.numbers import Untranslatable
-from stlc.diagnostics import UsageError, usage
+from stlc.diagnostics import usage
 from stlc.escape import c_comment, c_string
 from stlc.files import File, place
 from stlc.monitor.online.kernel import streamed_rule
@@ -82,7 +82,7 @@ def export_monitor(
         if rule is None:
             why = "it has a `freeze`, or a window to an end inside of another"
             message = f"`{asked.rule.name}` has no form as C: {why}"
-            raise UsageError.of("U101", message, asked.rule.span)
+            raise usage(message, span=asked.rule.span)
     try:
         program = streams_of([rule for rule in rules if rule is not None], online.signals, cut=False)
     except Untranslatable as error:

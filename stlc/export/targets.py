@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from stlc.diagnostics import usage
 from stlc.files import File
 from stlc.foreign import driving
-from stlc.options import Option, Options, taking
+from stlc.options import Option, Options
 from stlc.rundir import RunDir
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class ExportOptions(Options):
     runs: Options.Runs = RunDir.RUNS
 
 
-@taking(ExportOptions)
+@Options.taking(ExportOptions)
 def export(what: Run | ast.Spec | Path | str, options: ExportOptions) -> Exported | ExportedMonitor:
     """Export the controller of a run, with its monitor, or the monitor of a specification as C.
 

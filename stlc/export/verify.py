@@ -360,5 +360,5 @@ def answers(command: Sequence[str], states: Sequence[Sequence[float]]) -> list[l
     except toolchain.HangsError as hangs:
         raise RunError(_disagreement(f"the example program {hangs.why}")) from hangs
     if done.code:
-        raise RunError(_disagreement(f"the example program {toolchain.failure(done)}"))
+        raise RunError(_disagreement(f"the example program {done.failure}"))
     return [[float(word) for word in line.split()] for line in done.out.splitlines()]

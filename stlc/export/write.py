@@ -14,7 +14,7 @@ import torch
 
 from stlc.compile.backends.numbers import Untranslatable
 from stlc.controller.run.run import Run
-from stlc.diagnostics import Diagnostic, UsageError, usage
+from stlc.diagnostics import usage
 from stlc.export import c_header
 from stlc.export.c_header import public, weights
 from stlc.export.onnx_write import PRECISIONS, Latency, Precision, timed, write_onnx
@@ -214,8 +214,7 @@ def _c(run: Run, folder: Path) -> Checked:
     try:
         text = c_header.header(run.task, run.network)
     except Untranslatable as error:
-        finding = Diagnostic("U101", f"this task has no C form: {error}", help=("take --to torch instead",))
-        raise UsageError(finding) from error
+        raise usage(f"this task has no C form: {error}", "take --to torch instead") from error
     headers = {"stlc_controller.h": text, "stlc_weights.h": weights(run.network)}
     texts = {
         **public(headers, "STLC_CONTROLLER_H"),

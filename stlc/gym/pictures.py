@@ -11,7 +11,6 @@ from torch import Tensor
 
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import usage
-from stlc.view.animation import frames_in
 from stlc.view.scene import DrawScene, SceneOptions, scene_animation
 
 RenderMode: TypeAlias = Literal["rgb_array"]
@@ -61,7 +60,7 @@ class Pictures:
         scene["decision"] = np.zeros((len(self._seen), 1), dtype=np.int64)
         animation = scene_animation(scene, SceneOptions(self._draw, self._dt))
         last = len(self._seen) - 1
-        (image,) = frames_in(animation, range(last, last + 1), DPI)
+        (image,) = animation.images(range(last, last + 1), DPI)
         self._size = self._size or image.size
         if image.size != self._size:
             image = image.resize(self._size)

@@ -15,7 +15,7 @@ from stlc.compile.ir.discretize import Horizon
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.semantics import Semantics, semantics_of
 from stlc.compile.semantics.tolerance import TOLERANCE, End, Status
-from stlc.diagnostics import Diagnostic, UsageError, usage
+from stlc.diagnostics import Diagnostic, usage
 from stlc.jsontext import Num
 from stlc.monitor.facts.extent import samples_read
 from stlc.monitor.facts.fact import Fact
@@ -728,10 +728,9 @@ def require_known(names: Sequence[str], known: Sequence[str]) -> None:
         raise usage("requirements are a list of names", f'["{names}"]')
     for name in names:
         if name not in known:
-            raise UsageError.of(
-                "U101",
+            raise usage(
                 f"there is no requirement `{name}`",
-                help=did_you_mean(name, known),
+                *did_you_mean(name, known),
                 note=(f"requirements: {', '.join(known)}",),
             )
 

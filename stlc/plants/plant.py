@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import usage
-from stlc.dynamics.declaration.inputs import drawn_numbers, signal_values
 from stlc.plants.declaration import PlantDecl, load_plant_decl
 from stlc.plants.kind import Reason
 from stlc.plants.messages import Message
@@ -158,7 +157,7 @@ class Plant:
         found = np.minimum(low + (high - low) * np.asarray(uniforms, dtype=np.float64), high)
         for signal, columns in self._free():
             if columns:
-                found[:, columns] = drawn_numbers(signal, np.asarray(uniforms, dtype=np.float64)[:, columns])
+                found[:, columns] = signal.drawn(np.asarray(uniforms, dtype=np.float64)[:, columns])
         return found
 
     def random_point(self, seed: int) -> Floats:
@@ -183,7 +182,7 @@ class Plant:
                 continue
             numbers = point[columns].copy()
             numbers[signal.points :] = np.sort(numbers[signal.points :])
-            values = signal_values(signal, numbers[None], times)[0]
+            values = signal.at(numbers[None], times)[0]
             found[:, index] = np.clip(values, signal.low, signal.high)  # but for rounding they are inside
         return found
 

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, RunError, UsageError
+from stlc.diagnostics import Diagnostic, RunError, usage
 from stlc.runtime.prefixes import SAMPLINGS, PrefixGrid
 
 Numbers: TypeAlias = NDArray[np.float64]
@@ -143,7 +143,7 @@ def read_facts(where: Path | str) -> Facts:
     """
     path = Path(where)
     if not path.exists():
-        raise UsageError.of("U102", f"there is no controller `{path}`")
+        raise usage(f"there is no controller `{path}`", code="U102")
     folder = path if path.is_dir() else path.parent
     try:
         return _facts(json.loads(_content(folder / FACTS)), folder)

@@ -111,6 +111,14 @@ class TraceMeta:
             return self.planned
         return Carried("", self.judge_path, self.judge_text, self.judge_library, self.judge_set)
 
+    def array(self, signature: Signature) -> NDArray[Any]:
+        """Return metadata and signal descriptions as a JSON text in an array without axes.
+
+        This is the inverse of `read_meta`.
+        """
+        signals = {column.name: _written(column) for column in signature.columns}
+        return np.array(json.dumps(asdict(self) | {"signals": signals}))
+
 
 def read_meta(path: Path, array: NDArray[Any] | None) -> tuple[TraceMeta, dict[str, Column]]:
     """Return the metadata in the array `meta` of a trace, and the descriptions of its signals.
@@ -127,15 +135,6 @@ def read_meta(path: Path, array: NDArray[Any] | None) -> tuple[TraceMeta, dict[s
         return _meta_of(written), {n: _column(n, entry) for n, entry in written.get("signals", {}).items()}
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
         raise unreadable(path, f"`meta` is damaged ({str(error)[:80]})") from None
-
-
-def meta_array(meta: TraceMeta, signature: Signature) -> NDArray[Any]:
-    """Return metadata and signal descriptions as a JSON text in an array without axes.
-
-    This is the inverse of `read_meta`.
-    """
-    signals = {column.name: _written(column) for column in signature.columns}
-    return np.array(json.dumps(asdict(meta) | {"signals": signals}))
 
 
 def _meta_of(written: Mapping[str, Any]) -> TraceMeta:

@@ -59,6 +59,22 @@ class Animation:
         """Speed of the animation as a multiple of real time."""
         return speed_up(self.frames, self.dt)
 
+    def images(self, indices: range, dpi: int) -> Iterator[Image]:
+        """Yield the instants `indices` as RGB images."""
+        from PIL import Image
+
+        with picture_style():
+            figure = new_figure(*self.size)
+            figure.set_dpi(dpi)
+            figure.set_facecolor(PAPER)
+            turn = self.begin(figure)
+            canvas: Any = figure.canvas
+            for index in indices:
+                turn(index)
+                if not self.draws:
+                    canvas.draw()
+                yield Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+
 
 Command: TypeAlias = tuple[Any, ...]
 
@@ -146,7 +162,7 @@ def save_animation(
     """
     stride = max(1, -(-animation.frames // max_frames))
     milliseconds = max(20, round(1000 * stride * animation.dt / animation.speed))
-    pictures = list(frames_in(animation, range(0, animation.frames, stride), DPI))
+    pictures = list(animation.images(range(0, animation.frames, stride), DPI))
     File(gif).write(fitting(pictures, milliseconds, max_bytes))
 
 
@@ -161,30 +177,13 @@ def still_bytes(
 ) -> bytes:
     """Return a PNG or WebP file of one instant of `animation` (default: its `moment`), as bytes."""
     index = min(animation.frames - 1, animation.moment if at is None else at)
-    (picture,) = frames_in(animation, range(index, index + 1), dpi)
+    (picture,) = animation.images(range(index, index + 1), dpi)
     buffer = io.BytesIO()
     if kind == "webp":
         picture.save(buffer, format="webp", quality=QUALITY)
     else:
         picture.save(buffer, format="png", optimize=True)
     return buffer.getvalue()
-
-
-def frames_in(animation: Animation, indices: range, dpi: int) -> Iterator[Image]:
-    """Yield the instants `indices` as RGB images."""
-    from PIL import Image
-
-    with picture_style():
-        figure = new_figure(*animation.size)
-        figure.set_dpi(dpi)
-        figure.set_facecolor(PAPER)
-        turn = animation.begin(figure)
-        canvas: Any = figure.canvas
-        for index in indices:
-            turn(index)
-            if not animation.draws:
-                canvas.draw()
-            yield Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
 
 
 # ---------------------------------------------------------------------- gif

@@ -80,6 +80,53 @@ class HeldOut:
         failing = ~TOLERANCE.satisfied(self.rho)
         return int(failing.sum()), 0 if self.known is None else int((failing & self.known).sum())
 
+    def weakness(self, requirement: int | None = None) -> Weakness | None:
+        """Return the region in which a requirement fails; None if it never fails.
+
+        `requirement` is the index of the requirement. By default, the requirement that is violated from the
+        most starts is chosen.
+        """
+        index = self.worst if requirement is None else requirement
+        failing = TOLERANCE.violated(self.each[:, index])
+        if not failing.any():
+            return None
+        conditions = _grow(self.x0, failing) if failing.sum() >= ENOUGH else ()
+        region = _region(self.x0, conditions)
+        # drawn are states of an inequality, then those that best separate failing from satisfied starts
+        used, every = [each.column for each in conditions if each.op != "="], range(self.x0.shape[1])
+        focus = _region(self.x0, [each for each in conditions if each.op == "="])
+        many = [c for c in every if len(np.unique(self.x0[focus, c])) > FEW_VALUES] or every
+        ranked = sorted(many, key=lambda c: -_separation(self.x0[focus, c], failing[focus]))
+        first, second, *_ = [*dict.fromkeys([*used, *ranked]), *every, 0, 0]
+        return Weakness(
+            requirement=index,
+            failing=float(failing.mean()),
+            conditions=conditions,
+            inside=float(failing[region].mean()),
+            covered=float(region[failing].mean()),
+            axes=(first, second),
+        )
+
+    @property
+    def unsolved_text(self) -> str:
+        """Sentence on the starts from which the policy's plan fails.
+
+        It gives their number, and for how many of them a satisfying plan is known.
+        """
+        failing, known = self.unsolved
+        text = f"{failing:,} of {len(self.x0):,} starts"
+        if self.known is None or not failing:
+            return text
+        if self.unsearched:
+            tried = failing - self.unsearched
+            return f"{text}; a satisfying plan is known for {known:,} of the {tried:,} that were searched"
+        if not known:
+            return f"{text}; no satisfying plan is known for any of them"
+        if known == failing:
+            return f"{text}; a satisfying plan is known for each of them"
+        none = failing - known
+        return f"{text}; a satisfying plan is known for {known:,} of them, for {none:,} none was found"
+
 
 @dataclass(frozen=True, slots=True)
 class Condition:
@@ -117,6 +164,21 @@ class Weakness:
     covered: float
     axes: tuple[int, int]
 
+    def text(self, held: HeldOut, signature: Signature | None = None) -> str:
+        """Clause on a failure region: `fails in 80 % of the starts with x <= -1 m (70 % of its failures)`.
+
+        The first number is the share of starts in the region that fail. The second is the share of all
+        failing starts that lie in the region.
+        """
+        if not self.conditions:
+            failing = round(self.failing * len(held.x0))
+            return f"fails in {failing:,} of {len(held.x0):,} starts, in no region of their own"
+        region = region_text(self.conditions, held.names, signature)
+        return (
+            f"fails in {100 * self.inside:.0f} % of the starts with {region}"
+            f" ({100 * self.covered:.0f} % of its failures)"
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class HeldOutNames:
@@ -148,34 +210,6 @@ def load_held_out(run: RunDir) -> HeldOut | None:
     if any(mask is not None and mask.shape != rho.shape for mask in (known, searched)):
         return None
     return HeldOut(names, requirements, x0, rho, each, known, searched)
-
-
-def find_weakness(held: HeldOut, requirement: int | None = None) -> Weakness | None:
-    """Return the region in which a requirement fails; None if it never fails.
-
-    `requirement` is the index of the requirement. By default, the requirement that is violated from the most
-    starts is chosen.
-    """
-    index = held.worst if requirement is None else requirement
-    failing = TOLERANCE.violated(held.each[:, index])
-    if not failing.any():
-        return None
-    conditions = _grow(held.x0, failing) if failing.sum() >= ENOUGH else ()
-    region = _region(held.x0, conditions)
-    # drawn are states of an inequality, then those that best separate failing from satisfied starts
-    used, every = [each.column for each in conditions if each.op != "="], range(held.x0.shape[1])
-    focus = _region(held.x0, [each for each in conditions if each.op == "="])
-    many = [c for c in every if len(np.unique(held.x0[focus, c])) > FEW_VALUES] or every
-    ranked = sorted(many, key=lambda c: -_separation(held.x0[focus, c], failing[focus]))
-    first, second, *_ = [*dict.fromkeys([*used, *ranked]), *every, 0, 0]
-    return Weakness(
-        requirement=index,
-        failing=float(failing.mean()),
-        conditions=conditions,
-        inside=float(failing[region].mean()),
-        covered=float(region[failing].mean()),
-        axes=(first, second),
-    )
 
 
 def _grow(x0: Array, failing: Mask) -> tuple[Condition, ...]:
@@ -298,41 +332,6 @@ def _column_text(conditions: list[Condition], name: str, signature: Signature | 
     return f"{name} >= {low:g}{unit}" if low is not None else f"{name} <= {high:g}{unit}"
 
 
-def weakness_text(weakness: Weakness, held: HeldOut, signature: Signature | None = None) -> str:
-    """Clause on a failure region: `fails in 80 % of the starts with x <= -1 m (70 % of its failures)`.
-
-    The first number is the share of starts in the region that fail. The second is the share of all failing
-    starts that lie in the region.
-    """
-    if not weakness.conditions:
-        failing = round(weakness.failing * len(held.x0))
-        return f"fails in {failing:,} of {len(held.x0):,} starts, in no region of their own"
-    region = region_text(weakness.conditions, held.names, signature)
-    return (
-        f"fails in {100 * weakness.inside:.0f} % of the starts with {region}"
-        f" ({100 * weakness.covered:.0f} % of its failures)"
-    )
-
-
-def unsolved_text(held: HeldOut) -> str:
-    """Sentence on the starts from which the policy's plan fails.
-
-    It gives their number, and for how many of them a satisfying plan is known.
-    """
-    failing, known = held.unsolved
-    text = f"{failing:,} of {len(held.x0):,} starts"
-    if held.known is None or not failing:
-        return text
-    if held.unsearched:
-        tried = failing - held.unsearched
-        return f"{text}; a satisfying plan is known for {known:,} of the {tried:,} that were searched"
-    if not known:
-        return f"{text}; no satisfying plan is known for any of them"
-    if known == failing:
-        return f"{text}; a satisfying plan is known for each of them"
-    return f"{text}; a satisfying plan is known for {known:,} of them, for {failing - known:,} none was found"
-
-
 # ---------------------------------------------------------------------- failures
 
 
@@ -348,7 +347,7 @@ def draw_failures(
         signature: names, units and labels of the system's states.
         units: requirement -> unit of its robustness; it contains only requirements that have a unit.
     """
-    weakness = find_weakness(held)
+    weakness = held.weakness()
     if weakness is None:
         return None
     with picture_style():
@@ -357,7 +356,7 @@ def draw_failures(
         _draw_starts(left, held, weakness, signature)
         _draw_margins(right, held, weakness, units or {})
     name = held.requirements[weakness.requirement]
-    return Picture(figure, f"{name} {weakness_text(weakness, held, signature)}.")
+    return Picture(figure, f"{name} {weakness.text(held, signature)}.")
 
 
 def _draw_starts(axes: Axes, held: HeldOut, weakness: Weakness, signature: Signature | None) -> None:

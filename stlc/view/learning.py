@@ -22,7 +22,7 @@ from stlc.escape import operand, shell
 from stlc.registry import GUARDS
 from stlc.rundir import RunDir
 from stlc.signature import Signature
-from stlc.view.held_out import HeldOut, find_weakness, load_held_out, weakness_text
+from stlc.view.held_out import HeldOut, load_held_out
 from stlc.view.words import seconds as duration
 from stlc.view.words import share
 
@@ -249,9 +249,9 @@ def learning_on_record(
 
 def clause(held: HeldOut | None, signature: Signature | None) -> str:
     """Clause on the region in which the worst requirement fails; "" if none fails."""
-    if held is None or (weakness := find_weakness(held)) is None:
+    if held is None or (weakness := held.weakness()) is None:
         return ""
-    return weakness_text(weakness, held, signature)
+    return weakness.text(held, signature)
 
 
 def learning_of(

@@ -27,7 +27,7 @@ from stlc.view import require_drawing
 from stlc.view.contents import RunContents, read_contents, simulation_of, untagged
 from stlc.view.curves import draw_curves
 from stlc.view.deployment import deployment_section, deployment_tiles
-from stlc.view.held_out import draw_failures, unsolved_text
+from stlc.view.held_out import draw_failures
 from stlc.view.html import (
     Child,
     Html,
@@ -374,7 +374,7 @@ def failures_section(contents: RunContents) -> Section | None:
         "Right: robustness of the plans (counts on a logarithmic scale)."
     )
     body = figure(picture.data_uri(), picture.alt, caption)
-    left = el("p", f"Unsolved: {unsolved_text(contents.held_out)}.")
+    left = el("p", f"Unsolved: {contents.held_out.unsolved_text}.")
     return Section("failures", "Where plans fail", join(left, el("p", picture.alt), body), picture)
 
 

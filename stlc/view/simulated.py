@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from stlc.activity import PULSE
 from stlc.assurance.options import SimulateOptions
 from stlc.escape import visible
-from stlc.options import taking
+from stlc.options import Options
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from stlc.controller.run.run import Run
 
 
-@taking(SimulateOptions)
+@Options.taking(SimulateOptions)
 def simulate(subject: Run | Path | str, options: SimulateOptions) -> Simulation | PlantSimulation:
     """Deploy a policy in the world of its system, without and with a guard, and judge its closed-loop runs.
 

@@ -10,10 +10,10 @@ from stlc.controller.problem.task import Task
 from stlc.controller.run.run import Run
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import open_folder
-from stlc.controller.training.loop import Watch, prepare, run
+from stlc.controller.training.loop import Watch, prepare
 from stlc.controller.training.options import TrainOptions
 from stlc.diagnostics import usage
-from stlc.options import taking
+from stlc.options import Options
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,7 +23,7 @@ class ShownTraining(TrainOptions):
     progress: bool = True
 
 
-@taking(ShownTraining)
+@Options.taking(ShownTraining)
 def train(task: Task, options: ShownTraining) -> Run:
     """Train a policy in a new folder below `runs/` and return the run.
 
@@ -57,4 +57,4 @@ def train(task: Task, options: ShownTraining) -> Run:
 
         watch = Watch(row=row, evaluating=lambda text: bar.update(shown, told=text))
         config = TrainConfig(**chosen)
-        return run(prepare(task, config), open_folder(task, config), watch).run
+        return prepare(task, config).run(open_folder(task, config), watch).run

@@ -18,7 +18,6 @@ from stlc.assurance.certificate import (
     Noun,
     Sample,
     StoredStatement,
-    assess,
     joined,
     together,
     wrong_numbers,
@@ -40,7 +39,7 @@ def sample(robustness: list[float], units: list[int] | None = None, noun: Noun =
 
 
 def test_drives_of_a_world_are_one_observation() -> None:
-    found = assess(sample([1, -1, 2, 3, 4, 5], [0, 0, 1, 1, 2, 2], "world"), Claim())
+    found = sample([1, -1, 2, 3, 4, 5], [0, 0, 1, 1, 2, 2], "world").assess(Claim())
     overall = found.overall
     assert (overall.drives, overall.units, overall.satisfied, overall.whole) == (6, 3, 5, 2)
     assert overall.share == pytest.approx(5 / 6)
@@ -51,7 +50,7 @@ def test_drives_of_a_world_are_one_observation() -> None:
 
 
 def test_a_drive_without_a_verdict_counts_against_both_bounds() -> None:
-    found = assess(sample([1] * 60 + [-np.inf] * 5), Claim(any_time=True)).overall
+    found = sample([1] * 60 + [-np.inf] * 5).assess(Claim(any_time=True)).overall
     assert (found.satisfied, found.undecided) == (60, 5)
     assert found.shares.lower == betting_lower(Tally.counted(60, 65))
     assert found.shares.upper == betting_upper(Tally.counted(65, 65)) == 1.0
@@ -88,7 +87,7 @@ def test_a_certificate_is_consistent(
     values: list[float], any_time: bool, share: float | None, shift: float
 ) -> None:
     units = [index // 2 for index in range(len(values))]
-    found = assess(sample(values, units, "world"), Claim(share, shift=shift, any_time=any_time))
+    found = sample(values, units, "world").assess(Claim(share, shift=shift, any_time=any_time))
     document: Any = plain(found)
     whole, *each = (read(StoredStatement, one) for one in (document["overall"], *document["requirements"]))
     assert wrong_numbers(whole, each, found.claim, document["answer"]) == []
@@ -108,5 +107,5 @@ def answer_code(found: Assessment) -> int:
 
 def test_only_the_first_units_calibrate_where_results_stop_the_drives() -> None:
     values = [float(value) for value in range(100, 0, -1)]
-    assert assess(sample(values), Claim(any_time=True, calibration=40)).overall.next_robustness == 62.0
-    assert assess(sample(values), Claim()).overall.next_robustness == 5.0
+    assert sample(values).assess(Claim(any_time=True, calibration=40)).overall.next_robustness == 62.0
+    assert sample(values).assess(Claim()).overall.next_robustness == 5.0

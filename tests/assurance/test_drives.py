@@ -12,7 +12,7 @@ import torch
 from helpers.small_systems import moved_by_steps
 
 from stlc.assurance.campaign import BATCH, FIRST, SEED, Campaign, campaign
-from stlc.assurance.certificate import Claim, Judged, Sample, assess
+from stlc.assurance.certificate import Claim, Judged, Sample
 from stlc.assurance.drives import PolicyDrives, sample_of
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import Setting
@@ -121,7 +121,7 @@ def test_drives_that_violate_an_assumption_are_left_out(tmp_path: Path) -> None:
         assert found.overall.satisfied.tolist() == [True, False]
         assert found.requirements[0].violated.tolist() == [False, True]
         assert len(found.predicted) == 2
-    bounds = assess(found, Claim(0.9))
+    bounds = found.assess(Claim(0.9))
     assert bounds.left_out == 2
     assert "2 drives that violate an assumption of the specification are left out" in bounds.assumptions
 

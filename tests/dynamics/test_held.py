@@ -11,7 +11,6 @@ import torch
 import stlc
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import StlcError
-from stlc.dynamics.declaration.decl import describe
 from stlc.dynamics.system import System
 
 Make = Callable[..., System]
@@ -130,7 +129,7 @@ def test_what_policies_see_and_what_is_shown(make: Make) -> None:
     system = make(PLANT + "held: {u: {every: 0.2 s, value: prev(x)}}\n")
     assert [num.name for num in system.decl.policy.observe] == ["x", "y", "u"]
     assert set(system.decl.hidden) == {"step_count", "x_1_ago_of_2"}
-    assert "u       any  = prev(x)" in describe(system.decl)
+    assert "u       any  = prev(x)" in system.decl.describe()
 
 
 @pytest.mark.parametrize(

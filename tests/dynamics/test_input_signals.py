@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 import stlc
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import StlcError
-from stlc.dynamics.declaration.decl import describe
-from stlc.dynamics.declaration.inputs import InputDecl, drawn_numbers, signal_values
+from stlc.dynamics.declaration.inputs import InputDecl
 from stlc.dynamics.model.samplers import Rows
 from stlc.dynamics.system import System
 
@@ -46,7 +45,7 @@ def signals(system: System, x: np.ndarray) -> dict[str, tuple[np.ndarray, np.nda
     found = {}
     for decl in system.decl.inputs:
         numbers = x[:, 0, [system.names.index(name) for name in decl.columns]]
-        found[decl.name] = x[:, :, system.names.index(decl.name)], signal_values(decl, numbers, times)
+        found[decl.name] = x[:, :, system.names.index(decl.name)], decl.at(numbers, times)
     return found
 
 
@@ -119,7 +118,7 @@ def test_initial_states_draw_what_uniform_numbers_give(
     x0 = system.sample(6, seed=seed, dtype=torch.float64)
     generator = torch.Generator().manual_seed(seed)
     uniforms = torch.stack([Rows(6, generator).uniforms() for _ in decl.columns], 1)
-    wanted = drawn_numbers(decl, uniforms.numpy())
+    wanted = decl.drawn(uniforms.numpy())
     at = [system.names.index(name) for name in decl.columns]
     np.testing.assert_allclose(x0[:, at].numpy(), wanted, atol=1e-12)
 
@@ -147,8 +146,8 @@ def test_the_declaration(make: Make) -> None:
     (decl,) = system.decl.inputs
     assert isinstance(decl, InputDecl)
     assert (decl.low, decl.high, decl.pieces, decl.duration, decl.free_times) == (0.0, 0.2, 3, 3, False)
-    assert "u  [m]  [0, 0.2]  3 pieces, pchip, 3 s" in describe(system.decl)
-    assert "u_values" not in describe(system.decl)
+    assert "u  [m]  [0, 0.2]  3 pieces, pchip, 3 s" in system.decl.describe()
+    assert "u_values" not in system.decl.describe()
 
 
 def test_an_input_signal_of_a_discrete_system(make: Make) -> None:

@@ -13,7 +13,6 @@ import torch
 
 from stlc.compile.semantics.switch import Tanh
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics.declaration.decl import describe
 from stlc.dynamics.load import load_system_decl, parse_system
 from stlc.dynamics.model.controls import raw_width, squash
 from stlc.dynamics.system import PROBED, System
@@ -154,7 +153,7 @@ def test_the_hash_follows_text_and_overrides(make: Make) -> None:
 
 def test_the_description_is_a_table(make: Make) -> None:
     windy = "scenario: {calm: {override: {x: 1}}, windy: {doc: A gust., override: {x: 2}}}\n"
-    assert describe(make(MIXED + windy).decl).splitlines() == [
+    assert make(MIXED + windy).decl.describe().splitlines() == [
         "small",
         "dt = 0.1 s, T = 4 steps = 0.4 s, euler",
         "",
@@ -180,8 +179,7 @@ def test_the_description_is_a_table(make: Make) -> None:
 def test_a_declaration_needs_no_torch() -> None:
     code = (
         "import sys; from stlc.dynamics.load import load_system_decl;"
-        "from stlc.dynamics.declaration.decl import describe;"
-        "print(describe(load_system_decl('examples/car.yaml'))); assert 'torch' not in sys.modules"
+        "print(load_system_decl('examples/car.yaml').describe()); assert 'torch' not in sys.modules"
     )
     root = Path(__file__).parent.parent.parent
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=False)

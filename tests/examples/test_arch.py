@@ -14,7 +14,6 @@ from scipy.interpolate import RegularGridInterpolator
 
 import stlc
 from stlc.controller.problem.task import Task
-from stlc.dynamics.declaration.inputs import signal_values
 from stlc.dynamics.system import System
 
 pytestmark = pytest.mark.apart
@@ -53,7 +52,7 @@ def simulated(
     columns = {each: x[:, :, i].numpy() for i, each in enumerate(system.names)}
     times = np.arange(system.horizon + 1) * system.dt
     signals = {
-        each.name: signal_values(each, np.stack([columns[n][:, 0] for n in each.columns], 1), times)
+        each.name: each.at(np.stack([columns[n][:, 0] for n in each.columns], 1), times)
         for each in system.decl.inputs
     }
     for signal, values in signals.items():

@@ -10,7 +10,6 @@ import pytest
 from helpers.plants import FILE, changed, pendulum, read, simulated
 
 from stlc.diagnostics import MissingError, SystemFileError, UsageError
-from stlc.dynamics.declaration.inputs import signal_values
 from stlc.extras import installation
 from stlc.monitor.verdict import Monitor
 from stlc.plants.plant import Plant, load_plant
@@ -99,7 +98,7 @@ def test_a_trace_has_outputs_inputs_and_parameters(plant, folder, monkeypatch):
     assert trace.signature.names == ("angle", "rate", "torque", "length")
     assert [column.unit.text for column in trace.signature.columns] == ["rad", "rad/s", "rad/s^2", "m"]
     assert (trace.samples, trace.dt, trace.t0) == (101, 0.01, 0.0)
-    wanted = signal_values(plant.decl.free[0], point[None, 2:], trace.times)
+    wanted = plant.decl.free[0].at(point[None, 2:], trace.times)
     assert (trace.data["torque"] == wanted).all()
     assert (trace.data["length"] == point[1]).all()
     monkeypatch.setattr("sys.path", [])

@@ -7,15 +7,7 @@ import numpy as np
 import pytest
 
 from stlc.rundir import RunDir
-from stlc.view.held_out import (
-    HeldOut,
-    draw_failures,
-    find_weakness,
-    load_held_out,
-    region_text,
-    unsolved_text,
-    weakness_text,
-)
+from stlc.view.held_out import HeldOut, draw_failures, load_held_out, region_text
 
 
 def held(x0, each, names=None, requirements=None):
@@ -38,7 +30,7 @@ def boxed(seed=0, count=4000):
 @pytest.mark.parametrize("seed", range(3))
 def test_a_box_is_found(seed):
     data, failing = boxed(seed)
-    weakness = find_weakness(data)
+    weakness = data.weakness()
     assert weakness.failing == pytest.approx(failing.mean())
     assert weakness.inside > 0.97
     assert weakness.covered > 0.97
@@ -48,7 +40,7 @@ def test_a_box_is_found(seed):
 
 def test_shares_are_those_of_the_region():
     data, failing = boxed()
-    weakness = find_weakness(data)
+    weakness = data.weakness()
     region = np.logical_and.reduce([c.holds(data.x0) for c in weakness.conditions])
     assert weakness.inside == pytest.approx(failing[region].mean())
     assert weakness.covered == pytest.approx(region[failing].mean())
@@ -58,15 +50,15 @@ def test_the_worst_requirement_is_taken():
     x0 = np.random.default_rng(0).uniform(0, 1, (100, 2))
     each = np.ones((100, 3))
     each[:20, 2] = each[:5, 1] = -1
-    assert find_weakness(held(x0, each)).requirement == 2
-    assert find_weakness(held(x0, each), 0) is None
+    assert held(x0, each).weakness().requirement == 2
+    assert held(x0, each).weakness(0) is None
 
 
 def test_everything_failing_has_no_region():
     x0 = np.random.default_rng(0).uniform(0, 1, (50, 2))
-    weakness = find_weakness(held(x0, -np.ones((50, 1))))
+    weakness = held(x0, -np.ones((50, 1))).weakness()
     assert weakness.conditions == ()
-    text = weakness_text(weakness, held(x0, -np.ones((50, 1))))
+    text = weakness.text(held(x0, -np.ones((50, 1))))
     assert text == "fails in 50 of 50 starts, in no region of their own"
 
 
@@ -74,7 +66,7 @@ def test_a_few_failures_make_no_region():
     data, _ = boxed()
     each = np.ones((4000, 1))
     each[:5] = -1
-    assert find_weakness(held(data.x0, each)).conditions == ()
+    assert held(data.x0, each).weakness().conditions == ()
 
 
 def test_a_value_that_many_starts_share_is_named():
@@ -82,20 +74,20 @@ def test_a_value_that_many_starts_share_is_named():
     rng = np.random.default_rng(0)
     gap = np.where(rng.random(2000) < 0.3, -1.0, rng.uniform(0, 10, 2000))
     each = np.where(gap == -1, -1.0, 1.0)[:, None]
-    weakness = find_weakness(held(np.stack([gap, rng.random(2000)], axis=1), each))
+    weakness = held(np.stack([gap, rng.random(2000)], axis=1), each).weakness()
     assert [(c.column, c.op, c.value) for c in weakness.conditions] == [(0, "=", -1.0)]
 
 
 def test_ties_count_as_satisfied():
     x0 = np.random.default_rng(0).uniform(0, 1, (50, 2))
-    assert find_weakness(held(x0, np.full((50, 1), -5e-7))) is None
+    assert held(x0, np.full((50, 1), -5e-7)).weakness() is None
 
 
 def test_words(signature):
     data, _ = boxed()
     data = HeldOut(("sign", "x", "v"), data.requirements, data.x0, data.rho, data.each)
-    weakness = find_weakness(data)
-    text = weakness_text(weakness, data, signature)
+    weakness = data.weakness()
+    text = weakness.text(data, signature)
     assert "sign = light" in text
     assert "<= x <=" in text
     assert " m" in text
@@ -153,15 +145,15 @@ def test_starts_without_a_known_plan_are_told_apart():
     told = replace(data, known=~hopeless)
     left, known = told.unsolved
     assert (left, known) == (failing.sum(), (failing & ~hopeless).sum())
-    assert unsolved_text(told) == (
+    assert told.unsolved_text == (
         f"{left} of 4,000 starts; a satisfying plan is known for {known} of them, "
         f"for {left - known} none was found"
     )
-    assert unsolved_text(data) == f"{left} of 4,000 starts"
+    assert data.unsolved_text == f"{left} of 4,000 starts"
     lost = replace(data, known=np.zeros(len(data.x0), dtype=bool))
-    assert unsolved_text(lost).endswith(" starts; no satisfying plan is known for any of them")
+    assert lost.unsolved_text.endswith(" starts; no satisfying plan is known for any of them")
     solvable = replace(data, known=np.ones(len(data.x0), dtype=bool))
-    assert unsolved_text(solvable).endswith("; a satisfying plan is known for each of them")
+    assert solvable.unsolved_text.endswith("; a satisfying plan is known for each of them")
     (legend,) = [axes.get_legend() for axes in draw_failures(solvable).figure.axes if axes.get_legend()]
     assert not any("(0)" in text.get_text() for text in legend.get_texts())
     (legend,) = [axes.get_legend() for axes in draw_failures(told).figure.axes if axes.get_legend()]

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from stlc.controller.options import bounded
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import usage
 from stlc.dynamics.model.controls import raw_width, squash
 
 if TYPE_CHECKING:
@@ -77,9 +77,7 @@ class Cem:
             UsageError: U101, `over` is neither `plan` nor `policy`.
         """
         if self.over not in ("plan", "policy"):
-            raise UsageError(
-                Diagnostic("U101", f"`over={self.over}` of planner `cem` is neither `plan` nor `policy`")
-            )
+            raise usage(f"`over={self.over}` of planner `cem` is neither `plan` nor `policy`")
         space = _Plans(task, self) if self.over == "plan" else _Policies(task, self)
         return lambda search: self._run(search, space)
 

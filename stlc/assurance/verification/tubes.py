@@ -33,7 +33,7 @@ from stlc.diagnostics import usage
 from stlc.dynamics.declaration.perturbable import perturbable
 from stlc.dynamics.model.rollout import Stepper
 from stlc.dynamics.model.samplers import Drawing
-from stlc.dynamics.model.step import build_step, commands
+from stlc.dynamics.model.step import build_step
 from stlc.dynamics.uncertainty.disturbance import ErrorSizes
 
 if TYPE_CHECKING:
@@ -308,7 +308,7 @@ class _Motion:
         self.numbers, self._stepper = step.numbers, Stepper(step)
         self._controls = [control.name for control in decl.controls]
         self._feedback = decl.feedback
-        self._commands = ArrayProgram(commands(decl)) if decl.feedback is not None else None
+        self._commands = ArrayProgram(decl.commands) if decl.feedback is not None else None
 
     def step(self, env: _Env, plan: Floats, errors: _ErrorForms | None, symbols: _Symbols) -> _Env:
         """States one step later.

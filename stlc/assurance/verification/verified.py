@@ -16,7 +16,7 @@ from stlc.assurance.verification.verify import ModeResult, Verification, Verifie
 from stlc.diagnostics import usage
 from stlc.foreign import driving
 from stlc.jsontext import Num
-from stlc.options import taking
+from stlc.options import Options
 
 if TYPE_CHECKING:
     from stlc.assurance.verification.loop import NetworkLoop
@@ -102,7 +102,7 @@ class Verified:
         return clopper_pearson_lower(self.states_proved, self.states) if self.states else 0.0
 
 
-@taking(VerifyOptions)
+@Options.taking(VerifyOptions)
 def verify(run: Run | Path | str, options: VerifyOptions) -> Verified:
     """Prove on boxes of initial states that plans of a policy, or loops with a network, satisfy a spec.
 

@@ -13,7 +13,7 @@ import typer
 
 from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command
-from stlc.diagnostics import Diagnostic, UsageError, usage
+from stlc.diagnostics import usage
 from stlc.escape import operand, shell, visible
 from stlc.files import File
 from stlc.registry import did_you_mean
@@ -118,8 +118,7 @@ def _require_new(paths: Iterable[Path], *, force: bool) -> None:
     there = [str(path) for path in paths if path.exists()]
     if there and not force:
         verb = "is" if len(there) == 1 else "are"
-        finding = Diagnostic("U101", f"{', '.join(there)} {verb} there already", help=("overwrite: --force",))
-        raise UsageError(finding)
+        raise usage(f"{', '.join(there)} {verb} there already", "overwrite: --force")
 
 
 # ------------------------------------------------------------------------ a project
@@ -161,7 +160,7 @@ def _example_files(name: str) -> dict[str, str]:
     specs = [path for path, system in _pairs() if name in (system.removesuffix(".yaml"), path.stem)]
     if not specs:
         advice, note = did_you_mean(name, examples()), (f"there are {', '.join(examples())}",)
-        raise UsageError.of("U101", f"there is no example `{name}`", help=advice, note=note)
+        raise usage(f"there is no example `{name}`", *advice, note=note)
     files: dict[str, str] = {}
     judges = [
         File.SPECS / judge for _, system in _pairs(specs) for judge in _JUDGE.findall(_installed(system))

@@ -31,7 +31,6 @@ GROUP = group("Show, check and list system files.", "stlc system show car.yaml")
 @subcommand(GROUP, "show", "stlc system show car.yaml")
 def show(system: _File, set_: Options.Overrides = Options.NONE) -> Answer[SystemFacts]:
     """Show the declarations of a system file, from states to scenarios."""
-    from stlc.dynamics.declaration.decl import describe as in_words
     from stlc.dynamics.facts import SystemFacts
 
     decl = _load(system, set_)
@@ -39,7 +38,7 @@ def show(system: _File, set_: Options.Overrides = Options.NONE) -> Answer[System
     def tell() -> None:
         say(f"system {decl.path}")
         show_diagnostics(decl.warnings)
-        emit(in_words(decl))
+        emit(decl.describe())
 
     return Answer(SystemFacts(decl), tell, diagnostics=decl.warnings)
 

@@ -15,7 +15,7 @@ import typer
 
 from stlc.cli.framework.help import MOVED_OPTIONS
 from stlc.cli.framework.output import Document, show_diagnostics
-from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError, os_reason
+from stlc.diagnostics import MissingError, StlcError, os_reason, usage
 from stlc.extras import absent
 
 INTERNAL_ERROR = 70
@@ -104,7 +104,7 @@ def _known(error: BaseException) -> StlcError | None:
         case ModuleNotFoundError():
             return absent(error)
     if callable(getattr(error, "format_message", None)):
-        return UsageError(_usage(error))
+        return _usage(error)
     return None
 
 
@@ -114,12 +114,12 @@ def _from_system(error: OSError) -> StlcError | None:
     if error.errno in _NO_WRITING:
         return MissingError.of("R201", f"cannot use{place or ' a file'}: {reason}")
     if error.errno in _NO_FILE and place:
-        return UsageError.of("U102", f"cannot open{place}: {reason}")
+        return usage(f"cannot open{place}: {reason}", code="U102")
     return None
 
 
-def _usage(error: BaseException) -> Diagnostic:
-    """Return the diagnostic U101 for an error in the command line that typer reports.
+def _usage(error: BaseException) -> StlcError:
+    """Return the error U101 for an error in the command line that typer reports.
 
     The error classes of typer are not public, so the error is recognised by its methods.
     """
@@ -131,8 +131,8 @@ def _usage(error: BaseException) -> Diagnostic:
     former = str(getattr(error, "option_name", ""))
     present = MOVED_OPTIONS.get(former, former)
     if present != former and any(present in param.opts for param in context.command.params):
-        return Diagnostic("U101", f"{former} is now called {present}", help=(f"{command} {present} …",))
-    return Diagnostic("U101", lowered, help=(f"{command} --help",))
+        return usage(f"{former} is now called {present}", f"{command} {present} …")
+    return usage(lowered, f"{command} --help")
 
 
 def _crash(error: BaseException, argv: Sequence[str]) -> StlcError:

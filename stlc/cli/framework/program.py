@@ -30,7 +30,7 @@ from stlc.cli.framework.errors import report as report_error
 from stlc.cli.framework.help import CommandHelp, ProgramHelp
 from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.output import COLOR, QUIET, Answer, ColorMode, emit, noticing, silence
-from stlc.diagnostics import Diagnostic, PluginError, UsageError
+from stlc.diagnostics import PluginError, usage
 from stlc.foreign import driving
 from stlc.options import Option
 from stlc.registry import Registry
@@ -294,8 +294,7 @@ class Program:
             with _stoppable() as stopped, noticing(), driving(self.drives):
                 name = rest[0] if rest else ""
                 if name in self.moved:
-                    finding = Diagnostic("U101", f"there is no command `{name}`", help=(self.moved[name],))
-                    raise UsageError(finding)
+                    raise usage(f"there is no command `{name}`", self.moved[name])
                 words = [*front, *rest]
                 with nullcontext() if QUIET.get() else PULSE.beating():
                     code = self.parser(name).main(args=words, prog_name=self.name, standalone_mode=False)

@@ -22,7 +22,6 @@ from stlc.compile.backends.c.emit import Motion, emit
 from stlc.compile.backends.numbers import Untranslatable
 from stlc.controller.problem.kernel import Adjoint, Advance, Kernel, ObjectiveSlopes, SearchOptions, Sizes
 from stlc.diagnostics import usage
-from stlc.dynamics.model.step import commands
 from stlc.native import Stop, load, never, why_none
 from stlc.toolchain import compiler
 
@@ -271,7 +270,7 @@ class NativeStep:
             UsageError: U101, `rewarded` is True, but the system file declares no reward.
         """
         reward = system.require_reward() if rewarded else None
-        given = commands(system.decl)
+        given = system.decl.commands
         try:
             text = emit_advance(motion_of(system), observed=system.observed, reward=reward, commands=given)
         except Untranslatable:

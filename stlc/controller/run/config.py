@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, fields
-from typing import get_args
+from typing import Self, get_args
 
 from stlc.controller.options import MOST, Bounds, bounds_of
 from stlc.options import Clock
@@ -88,6 +88,41 @@ class ResolvedConfig:
     falsify: bool = False
     whole: bool = False
 
+    def checked(self) -> Self:
+        """Return the options unchanged if all are valid.
+
+        Raises:
+            ValueError: an option has the wrong type, is out of its bounds, or names something unknown.
+        """
+        words = {
+            "method": METHODS.names,
+            "clock": get_args(Clock),
+            "planner": PLANNERS.names,
+        }
+        for option in fields(self):
+            value = getattr(self, option.name)
+            if option.name in words:
+                if value not in words[option.name]:
+                    known = ", ".join(words[option.name])
+                    raise ValueError(f"`{option.name}` is {value!r:.40}, none of {known}")
+                continue
+            if option.type in ("str", str):
+                if not isinstance(value, str) or len(value) > MOST_TEXT:
+                    raise ValueError(f"`{option.name}` is {value!r:.40}")
+                continue
+            if option.type in ("bool", bool):
+                if not isinstance(value, bool):
+                    raise ValueError(f"`{option.name}` is {value!r:.40}, neither true nor false")
+                continue
+            kinds = (int, float) if option.type in ("float", float) else (int,)
+            general = Bounds(float(option.name in _POSITIVE), _MOST.get(option.name, MOST))
+            bounds = bounds_of(option, general)
+            each = value if option.name == "hidden" else (value,)
+            fits = (isinstance(x, kinds) and not isinstance(x, bool) and x in bounds for x in each)
+            if not all(fits):
+                raise ValueError(f"`{option.name}` is {value!r:.40}, not {bounds}")
+        return self
+
 
 _MOST = {
     **dict.fromkeys(("hidden", "plans", "threads", "ranks"), 65_536),
@@ -102,39 +137,3 @@ MOST_TEXT = 1000
 
 
 _POSITIVE = ("hidden", "plans", "batch", "pool", "every", "ranks")
-
-
-def checked_config(config: ResolvedConfig) -> ResolvedConfig:
-    """Return the options unchanged if all are valid.
-
-    Raises:
-        ValueError: an option has the wrong type, is out of its bounds, or names something unknown.
-    """
-    words = {
-        "method": METHODS.names,
-        "clock": get_args(Clock),
-        "planner": PLANNERS.names,
-    }
-    for option in fields(config):
-        value = getattr(config, option.name)
-        if option.name in words:
-            if value not in words[option.name]:
-                known = ", ".join(words[option.name])
-                raise ValueError(f"`{option.name}` is {value!r:.40}, none of {known}")
-            continue
-        if option.type in ("str", str):
-            if not isinstance(value, str) or len(value) > MOST_TEXT:
-                raise ValueError(f"`{option.name}` is {value!r:.40}")
-            continue
-        if option.type in ("bool", bool):
-            if not isinstance(value, bool):
-                raise ValueError(f"`{option.name}` is {value!r:.40}, neither true nor false")
-            continue
-        kinds = (int, float) if option.type in ("float", float) else (int,)
-        general = Bounds(float(option.name in _POSITIVE), _MOST.get(option.name, MOST))
-        bounds = bounds_of(option, general)
-        each = value if option.name == "hidden" else (value,)
-        fits = (isinstance(x, kinds) and not isinstance(x, bool) and x in bounds for x in each)
-        if not all(fits):
-            raise ValueError(f"`{option.name}` is {value!r:.40}, not {bounds}")
-    return config

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from stlc.compile.frontend.modules import file_of
 from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.controller.run.checkpoint import load_checkpoint, weights
-from stlc.controller.run.config import ResolvedConfig, checked_config
+from stlc.controller.run.config import ResolvedConfig
 from stlc.diagnostics import PluginError, RunError
 from stlc.dynamics.load import load_system_decl
 from stlc.dynamics.scenario import scenario_constants, under
@@ -254,6 +254,6 @@ def load_config(folder: RunDir) -> ResolvedConfig:
     try:
         kind: type[ResolvedConfig] = METHODS.get(values["method"]).options
         engine = {field.name: values[field.name] for field in fields(kind) if field.name in values}
-        return checked_config(kind(**{**engine, "hidden": tuple(engine["hidden"])}))
+        return kind(**{**engine, "hidden": tuple(engine["hidden"])}).checked()
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise RunError(folder.damaged(CONFIG, error)) from error

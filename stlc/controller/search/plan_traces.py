@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.frontend.modules import library_of, spec_sha256
-from stlc.diagnostics import UsageError, usage
+from stlc.diagnostics import usage
 from stlc.grammar import ast
 from stlc.registry import did_you_mean
 from stlc.trace import Reading, Trace, TraceMeta
@@ -110,7 +110,7 @@ def _recorded(task: Task, text: str, count: int | None, seed: int) -> Tensor:
     """
     if not text.strip() or not Path(text).exists():
         help_ = ("random", "x=1, v=2 m/s", "a trace, such as trace.npz")
-        raise UsageError.of("U102", f"there is no file `{text}` with initial states", help=help_)
+        raise usage(f"there is no file `{text}` with initial states", *help_, code="U102")
     columns = task.system.signature.columns
     trace = Trace.load(text, Reading(words={column.name: column.words for column in columns}))
     rows = min(trace.traces, count or trace.traces)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import torch
 
 from stlc.controller.options import value_of
-from stlc.controller.run.config import ResolvedConfig, checked_config
+from stlc.controller.run.config import ResolvedConfig
 from stlc.controller.training.budget import StepSchedule
 from stlc.controller.training.options import TrainOptions
 from stlc.diagnostics import usage
@@ -77,7 +77,7 @@ def _with_own(found: ResolvedConfig, config: TrainConfig) -> ResolvedConfig:
         changed[name] = value_of(f"method `{found.method}`", own[name], text)
     advice = ("stlc train SPEC --option NAME=VALUE",) if changed else ()
     try:
-        return checked_config(replace(found, **changed))
+        return replace(found, **changed).checked()
     except ValueError as error:
         raise usage(f"method `{found.method}`: {error}", *advice) from None
 

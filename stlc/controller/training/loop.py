@@ -25,7 +25,7 @@ from stlc.controller.training.diagnose import check_mirror
 from stlc.controller.training.failures import SHARE, FailureSearch
 from stlc.controller.training.final_evaluation import FinalEvaluation, TrainingOutcome
 from stlc.controller.training.writer import RunWriter
-from stlc.diagnostics import RunError, StlcError, UsageError, usage
+from stlc.diagnostics import RunError, StlcError, usage
 from stlc.native import never
 from stlc.registry import METHODS
 
@@ -118,6 +118,33 @@ class Preparation:
     ranks: Ranks
     failures: FailureSearch | None
 
+    def run(self, folder: RunDir, watch: Watch | None = None) -> TrainingOutcome:
+        """Train a policy in a new run folder that already holds its specification and system.
+
+        Args:
+            folder: folder of the run; of several ranks, only the first writes files.
+            watch: functions that are called during the run; see `Watch`.
+
+        Raises:
+            MissingError: R201, a checkpoint cannot be written; R403, the process of another rank has ended or
+                does not answer.
+            RunError: R401, the loss or its gradient is not finite; R109, another process trains there.
+        """
+        watch, resolved, learner = watch or Watch(), self.config, self.learner
+        budget, schedule = self.budget, self.schedule
+        with _alone(folder, self.ranks):
+            writer = RunWriter(folder, writes=self.ranks.first)
+            writer.config(resolved)
+            chosen = {"engine": asdict(resolved), "schedule": str(schedule)}
+            writer.note({**chosen, "seconds_allowed": budget or None})
+            late = watch.late if resolved.clock == "wall" else None
+            allowed = TimeBudget.of(self.now, self.started, budget, late)
+            if learner is None:
+                method: Method = METHODS.get(resolved.method)
+                return _without_steps(method, self.task, resolved, writer, allowed, watch)
+            writer.note({"margin": learner.margin})
+            return _Session(writer, learner, watch, allowed, schedule, self.failures).finish()
+
 
 def prepare(
     task: Task, config: TrainConfig, *, ranks: Ranks = ALONE, failures: FailureSearch | None = None
@@ -171,36 +198,7 @@ def train(
 
     The arguments and errors are those of `prepare` and `run`.
     """
-    return run(prepare(task, config, ranks=ranks, failures=failures), folder, watch)
-
-
-def run(prepared: Preparation, folder: RunDir, watch: Watch | None = None) -> TrainingOutcome:
-    """Train a policy in a new run folder that already holds its specification and system.
-
-    Args:
-        prepared: the training.
-        folder: folder of the run; of several ranks, only the first writes files.
-        watch: functions that are called during the run; see `Watch`.
-
-    Raises:
-        MissingError: R201, a checkpoint cannot be written; R403, the process of another rank has ended or
-            does not answer.
-        RunError: R401, the loss or its gradient is not finite; R109, another process trains in the folder.
-    """
-    watch, resolved, learner = watch or Watch(), prepared.config, prepared.learner
-    budget, schedule = prepared.budget, prepared.schedule
-    with _alone(folder, prepared.ranks):
-        writer = RunWriter(folder, writes=prepared.ranks.first)
-        writer.config(resolved)
-        chosen = {"engine": asdict(resolved), "schedule": str(schedule)}
-        writer.note({**chosen, "seconds_allowed": budget or None})
-        late = watch.late if resolved.clock == "wall" else None
-        allowed = TimeBudget.of(prepared.now, prepared.started, budget, late)
-        if learner is None:
-            method: Method = METHODS.get(resolved.method)
-            return _without_steps(method, prepared.task, resolved, writer, allowed, watch)
-        writer.note({"margin": learner.margin})
-        return _Session(writer, learner, watch, allowed, schedule, prepared.failures).finish()
+    return prepare(task, config, ranks=ranks, failures=failures).run(folder, watch)
 
 
 def resume(
@@ -375,10 +373,10 @@ def _require_as_many(before: int, now: int) -> None:
     """
     if before != now:
         start = f"torchrun --nproc-per-node {before} -m stlc" if before > 1 else "stlc"
-        raise UsageError.of(
-            "R104",
+        raise usage(
             f"the run was trained by {before} process{'es' if before > 1 else ''} together, not by {now}",
-            help=(f"{start} train --resume RUN",),
+            f"{start} train --resume RUN",
+            code="R104",
             note=("every one of them has states of its own, which the run goes on with",),
         )
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from stlc.controller.run.config import DRIVES, HELD_OUT
 from stlc.controller.training.budget import StepSchedule
-from stlc.diagnostics import UsageError, usage
+from stlc.diagnostics import usage
 from stlc.options import Option, Options, parse_count
 from stlc.registry import METHODS
 
@@ -38,7 +38,7 @@ def parse_steps(text: str) -> int | StepSchedule:
     except ValueError as error:
         help_ = ("--steps 1200", "the schedule of a run is in its report and in its run.json")
         message = f"`--steps {text}` is no number of steps"
-        raise UsageError.of("U101", message, help=help_, note=(str(error),)) from None
+        raise usage(message, *help_, note=(str(error),)) from None
 
 
 def parse_rate(text: str) -> float:

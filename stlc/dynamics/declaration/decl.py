@@ -16,6 +16,8 @@ from types import MappingProxyType
 from typing import Any
 
 from stlc.compile.frontend.interface import Interface
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.algebra import add, multiply
 from stlc.compile.ir.discretize import Grid
 from stlc.diagnostics import Diagnostic
 from stlc.dynamics.declaration.deployment import BackupDecl, JudgeRef, ScenarioDecl, TestDecl, WorldRef
@@ -184,6 +186,74 @@ class SystemDecl:
             found[path.relative_to(home).as_posix() if below else path.name] = path
         return found
 
+    @property
+    def commands(self) -> dict[str, ir.Num]:
+        """Actuator commands as functions of state and plan: name of a control -> numeric expression.
+
+        Empty without inner feedback. Commands are computed once per step, as in a sampled-data controller.
+        """
+        feedback = self.feedback
+        if feedback is None:
+            return {}
+        found: dict[str, ir.Num] = {}
+        for i, each in enumerate(self.controls):
+            back: ir.Num = ir.Const(0.0)
+            for gain, state, at in zip(feedback.gain[i], self.signature.names, feedback.state, strict=True):
+                if gain:
+                    back = add(back, multiply(ir.Const(gain), ir.Op("sub", (ir.Const(at), ir.Signal(state)))))
+            most = feedback.authority[i]
+            bounded = ir.Op("clip", (back, ir.Const(-most), ir.Const(most)))
+            total = add(add(ir.Signal(each.name), ir.Const(feedback.control[i])), bounded)
+            found[each.name] = ir.Op("clip", (total, ir.Const(feedback.low[i]), ir.Const(feedback.high[i])))
+        return found
+
+    def describe(self) -> str:
+        """Lines of text on the system: states, controls, flow, jumps, initial states and scenarios."""
+        head = visible(f"{self.name}: {self.doc}" if self.doc else self.name)
+        substeps = f", {self.substeps} substeps" if self.substeps > 1 else ""
+        kind = "discrete" if self.discrete else self.integrator
+        horizon = time_text(self.dt * self.horizon)
+        grid = f"dt = {float(self.dt):g} s, T = {self.horizon} steps = {horizon}, {kind}{substeps}"
+        flow = {assign.name: assign.text for assign in self.flow}
+        rate = "{}' =" if self.discrete else "d{}/dt ="
+        jumps = [
+            (jump.name, f"when {jump.text}", ", ".join(f"{each.name} := {each.text}" for each in jump.resets))
+            for jump in self.jumps
+        ]
+        moves = {name: f"{rate.format(name)} {text}" for name, text in flow.items()}
+        moves |= {assign.name: f"= {assign.text}" for assign in self.updates}
+        apart = {*self.hidden, *(each.name for each in self.inputs)}
+        states = [column for column in self.signature.columns if column.name not in apart]
+        weights = sum(situation.weight for situation in self.init.mixture) or 1.0
+        blocks = (
+            ("states", [_state(each, moves.get(each.name)) for each in states]),
+            ("input signals", [_input(each) for each in self.inputs]),
+            (
+                "controls",
+                [
+                    (
+                        each.name,
+                        f"[{each.unit}]" * bool(each.unit.text),
+                        f"[{each.low:g}, {each.high:g}]",
+                        each.squash,
+                    )
+                    for each in self.controls
+                ],
+            ),
+            ("feedback beneath the plans", _feedback(self)),
+            ("jumps", jumps),
+            (
+                "initial situations",
+                [
+                    (each.name or f"situation {index}", f"{100 * each.weight / weights:.3g} %")
+                    for index, each in enumerate(self.init.mixture, 1)
+                ],
+            ),
+            ("kept where", [(text,) for text in self.init.where_text]),
+            ("scenarios", [(scenario.name, scenario.doc) for scenario in self.scenarios]),
+        )
+        return "\n".join([head, grid, *(line for title, rows in blocks for line in _table(title, rows))])
+
     def judges_by(self, spec: Path) -> bool:
         """True if the key `judge` of the section `test` or of a scenario refers to the file `spec`.
 
@@ -231,54 +301,6 @@ class SystemDecl:
 
 
 Row = tuple[str, ...]
-
-
-def describe(decl: SystemDecl) -> str:
-    """Describe a system as lines of text: states, controls, flow, jumps, initial states and scenarios."""
-    head = visible(f"{decl.name}: {decl.doc}" if decl.doc else decl.name)
-    substeps = f", {decl.substeps} substeps" if decl.substeps > 1 else ""
-    kind = "discrete" if decl.discrete else decl.integrator
-    horizon = time_text(decl.dt * decl.horizon)
-    grid = f"dt = {float(decl.dt):g} s, T = {decl.horizon} steps = {horizon}, {kind}{substeps}"
-    flow = {assign.name: assign.text for assign in decl.flow}
-    rate = "{}' =" if decl.discrete else "d{}/dt ="
-    jumps = [
-        (jump.name, f"when {jump.text}", ", ".join(f"{each.name} := {each.text}" for each in jump.resets))
-        for jump in decl.jumps
-    ]
-    moves = {name: f"{rate.format(name)} {text}" for name, text in flow.items()}
-    moves |= {assign.name: f"= {assign.text}" for assign in decl.updates}
-    apart = {*decl.hidden, *(each.name for each in decl.inputs)}
-    states = [column for column in decl.signature.columns if column.name not in apart]
-    weights = sum(situation.weight for situation in decl.init.mixture) or 1.0
-    blocks = (
-        ("states", [_state(each, moves.get(each.name)) for each in states]),
-        ("input signals", [_input(each) for each in decl.inputs]),
-        (
-            "controls",
-            [
-                (
-                    each.name,
-                    f"[{each.unit}]" * bool(each.unit.text),
-                    f"[{each.low:g}, {each.high:g}]",
-                    each.squash,
-                )
-                for each in decl.controls
-            ],
-        ),
-        ("feedback beneath the plans", _feedback(decl)),
-        ("jumps", jumps),
-        (
-            "initial situations",
-            [
-                (each.name or f"situation {index}", f"{100 * each.weight / weights:.3g} %")
-                for index, each in enumerate(decl.init.mixture, 1)
-            ],
-        ),
-        ("kept where", [(text,) for text in decl.init.where_text]),
-        ("scenarios", [(scenario.name, scenario.doc) for scenario in decl.scenarios]),
-    )
-    return "\n".join([head, grid, *(line for title, rows in blocks for line in _table(title, rows))])
 
 
 def _state(column: Column, moves: str | None) -> Row:

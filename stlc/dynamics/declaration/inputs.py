@@ -113,76 +113,72 @@ class InputDecl:
         """Ends of the pieces in seconds if the times are fixed: 0, the times in between, the duration."""
         return tuple(self.duration * index / self.pieces for index in range(self.pieces + 1))
 
+    def drawn(self, uniforms: Floats) -> Floats:
+        """Return the numbers of the signal that uniform random numbers give, as initial states do.
 
-def drawn_numbers(decl: InputDecl, uniforms: Floats) -> Floats:
-    """Return the numbers of an input signal that uniform random numbers give, as initial states do.
+        The values are evenly distributed over the range. The times are those of independent uniform times,
+        sorted.
 
-    The values are evenly distributed over the range. The times are those of independent uniform times,
-    sorted.
+        Args:
+            uniforms: numbers between 0 and 1, one per column of the signal, (batch, columns).
 
-    Args:
-        decl: the input signal.
-        uniforms: numbers between 0 and 1, one per column of the signal, (batch, columns).
+        Returns:
+            The numbers in the order of `columns`, (batch, columns), float64: values in the unit of the
+            signal, then times in seconds.
+        """
+        import numpy as np
 
-    Returns:
-        The numbers in the order of `decl.columns`, (batch, columns), float64: values in the unit of the
-        signal, then times in seconds.
-    """
-    import numpy as np
-
-    found = np.array(uniforms, dtype=np.float64)
-    values = decl.low + (decl.high - decl.low) * found[:, : decl.points]
-    found[:, : decl.points] = np.minimum(values, decl.high)  # the sum may be rounded up
-    rest = np.full(len(found), float(decl.duration))
-    for index in range(len(decl.times)):
-        column = decl.points + index
-        rest = rest * found[:, column] ** (1.0 / (len(decl.times) - index))
-        found[:, column] = float(decl.duration) - rest
-    return found
-
-
-def signal_values(decl: InputDecl, values: Floats, times: Floats) -> Floats:
-    """Return an input signal at given times.
-
-    A sample at a switching time belongs to the later piece. Before 0 the signal has its first value, after
-    the duration its last one.
-
-    Args:
-        decl: the input signal.
-        values: its numbers in the order of `decl.columns`, (batch, columns): values in the unit of the
-            signal, then the free times in seconds, which must not decrease.
-        times: times in seconds, (steps,).
-
-    Returns:
-        The signal in its unit, (batch, steps), float64.
-    """
-    import numpy as np
-
-    numbers = np.asarray(values, dtype=np.float64)
-    at = np.asarray(times, dtype=np.float64)
-    points, batch = numbers[:, : decl.points], len(numbers)
-    length = float(decl.duration)
-    if decl.free_times:
-        ends = np.zeros((batch, decl.pieces + 1))
-        ends[:, 1:-1], ends[:, -1] = numbers[:, decl.points :], length
-    else:
-        ends = np.broadcast_to([float(end) for end in decl.ends], (batch, decl.pieces + 1))
-    if decl.interpolate == "hold":
-        found = np.repeat(points[:, :1], len(at), axis=1)
-        for index in range(1, decl.pieces):
-            passed = at >= ends[:, index, None] - SLACK * length
-            found = np.where(passed, points[:, index, None], found)
+        found = np.array(uniforms, dtype=np.float64)
+        values = self.low + (self.high - self.low) * found[:, : self.points]
+        found[:, : self.points] = np.minimum(values, self.high)  # the sum may be rounded up
+        rest = np.full(len(found), float(self.duration))
+        for index in range(len(self.times)):
+            column = self.points + index
+            rest = rest * found[:, column] ** (1.0 / (len(self.times) - index))
+            found[:, column] = float(self.duration) - rest
         return found
-    widths = np.maximum(np.diff(ends, axis=1), SLACK * length)
-    share = np.clip((at - ends[:, :-1, None]) / widths[:, :, None], 0.0, 1.0)
-    rises = np.diff(points, axis=1)[:, :, None]
-    if decl.interpolate == "linear":
-        return np.asarray(points[:, :1] + (rises * share).sum(1))
-    slopes = pchip_slopes(points, widths)
-    left, right = (widths * slopes[:, :-1])[:, :, None], (widths * slopes[:, 1:])[:, :, None]
-    rest = 1.0 - share
-    parts = rises * share**2 * (3.0 - 2.0 * share) + share * rest * (left * rest - right * share)
-    return np.asarray(points[:, :1] + parts.sum(1))
+
+    def at(self, values: Floats, times: Floats) -> Floats:
+        """Return the signal at given times.
+
+        A sample at a switching time belongs to the later piece. Before 0 the signal has its first value,
+        after the duration its last one.
+
+        Args:
+            values: its numbers in the order of `columns`, (batch, columns): values in the unit of the
+                signal, then the free times in seconds, which must not decrease.
+            times: times in seconds, (steps,).
+
+        Returns:
+            The signal in its unit, (batch, steps), float64.
+        """
+        import numpy as np
+
+        numbers = np.asarray(values, dtype=np.float64)
+        at = np.asarray(times, dtype=np.float64)
+        points, batch = numbers[:, : self.points], len(numbers)
+        length = float(self.duration)
+        if self.free_times:
+            ends = np.zeros((batch, self.pieces + 1))
+            ends[:, 1:-1], ends[:, -1] = numbers[:, self.points :], length
+        else:
+            ends = np.broadcast_to([float(end) for end in self.ends], (batch, self.pieces + 1))
+        if self.interpolate == "hold":
+            found = np.repeat(points[:, :1], len(at), axis=1)
+            for index in range(1, self.pieces):
+                passed = at >= ends[:, index, None] - SLACK * length
+                found = np.where(passed, points[:, index, None], found)
+            return found
+        widths = np.maximum(np.diff(ends, axis=1), SLACK * length)
+        share = np.clip((at - ends[:, :-1, None]) / widths[:, :, None], 0.0, 1.0)
+        rises = np.diff(points, axis=1)[:, :, None]
+        if self.interpolate == "linear":
+            return np.asarray(points[:, :1] + (rises * share).sum(1))
+        slopes = pchip_slopes(points, widths)
+        left, right = (widths * slopes[:, :-1])[:, :, None], (widths * slopes[:, 1:])[:, :, None]
+        rest = 1.0 - share
+        parts = rises * share**2 * (3.0 - 2.0 * share) + share * rest * (left * rest - right * share)
+        return np.asarray(points[:, :1] + parts.sum(1))
 
 
 def pchip_slopes(points: Floats, widths: Floats) -> Floats:

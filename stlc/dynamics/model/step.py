@@ -44,7 +44,7 @@ def build_step(decl: SystemDecl, *, soft: bool) -> ModelStep:
     """
     writer = Assignments()
     start: State = {name: ir.Signal(name) for name in decl.signature.names}
-    given = {name: writer.name(num, name + "#{}") for name, num in commands(decl).items()}
+    given = {name: writer.name(num, name + "#{}") for name, num in decl.commands.items()}
     state = _flow(decl, writer, start, given)
     moved = {assign.name for assign in decl.flow}
     for jump in decl.jumps:
@@ -57,27 +57,6 @@ def build_step(decl: SystemDecl, *, soft: bool) -> ModelStep:
     moved |= {assign.name for assign in decl.updates}
     ordered = [name for name in decl.signature.names if name in moved | set(decl.clamps)]
     return ModelStep(tuple(writer.lets), {name: state[name] for name in ordered})
-
-
-def commands(decl: SystemDecl) -> dict[str, ir.Num]:
-    """Actuator commands as functions of state and plan: name of a control -> numeric expression.
-
-    Empty without inner feedback. Commands are computed once per step, as in a sampled-data controller.
-    """
-    feedback = decl.feedback
-    if feedback is None:
-        return {}
-    found: dict[str, ir.Num] = {}
-    for i, each in enumerate(decl.controls):
-        back: ir.Num = ir.Const(0.0)
-        for gain, state, at in zip(feedback.gain[i], decl.signature.names, feedback.state, strict=True):
-            if gain:
-                back = add(back, multiply(ir.Const(gain), ir.Op("sub", (ir.Const(at), ir.Signal(state)))))
-        most = feedback.authority[i]
-        bounded = ir.Op("clip", (back, ir.Const(-most), ir.Const(most)))
-        total = add(add(ir.Signal(each.name), ir.Const(feedback.control[i])), bounded)
-        found[each.name] = ir.Op("clip", (total, ir.Const(feedback.low[i]), ir.Const(feedback.high[i])))
-    return found
 
 
 def _given(jump: JumpDecl, given: State) -> JumpDecl:

@@ -21,7 +21,7 @@ from stlc.compile.ir.support import endless, farthest, history, reach
 from stlc.compile.ir.traverse import numbers, operands
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.tolerance import Status
-from stlc.diagnostics import UsageError
+from stlc.diagnostics import usage
 from stlc.monitor.instants import cut_bounds, growing_bounds, rule_bounds, window_of
 from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.tally import Asked, Flags, JudgedInstants, RequirementSummary
@@ -253,7 +253,7 @@ def _require_bounded(asked: Asked) -> None:
         what = f"every instant keeps values of its own, and {work:,} samples to look at"
         message = f"a stream cannot judge `{rule.name}`: {what}"
         advice = ("shorten its intervals", "`stlc check SPEC TRACE` judges a recording")
-        raise UsageError.of("E313", message, heaviest.span or rule.span, help=advice)
+        raise usage(message, *advice, code="E313", span=heaviest.span or rule.span)
 
 
 def _span(formula: ir.Formula) -> int:

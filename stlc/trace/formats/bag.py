@@ -17,7 +17,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from stlc.diagnostics import StlcError, UsageError
+from stlc.diagnostics import StlcError, usage
 from stlc.extras import needed
 from stlc.files import is_stored
 from stlc.trace.formats.messages import Bytes, Channel, DamageError, Decode, Log, Room, mapped
@@ -46,7 +46,7 @@ def read(path: Path, wanted: Wanted = ALL) -> Recording:
         stored = sorted((each for each in path.iterdir() if is_stored(each)), key=_order)
     if not stored:
         help_ = ("the folder of a bag holds .db3 or .mcap files",)
-        raise UsageError.of("U102", f"cannot read `{path}`: is a directory", help=help_)
+        raise usage(f"cannot read `{path}`: is a directory", *help_, code="U102")
     for each in stored:
         with damage(path):
             _add_stored(log, each)

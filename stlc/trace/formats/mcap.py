@@ -28,7 +28,7 @@ from stlc.trace.formats.messages import LONGEST, Bytes, Channel, DamageError, De
 from stlc.trace.formats.paths import Selection
 from stlc.trace.formats.registry import damage, unreadable
 from stlc.trace.formats.ros import Form, decoder
-from stlc.trace.meta import meta_array, read_meta
+from stlc.trace.meta import read_meta
 from stlc.trace.recording import ALL, ClockGroup, Recording, Wanted
 from stlc.trace.trace import Trace
 
@@ -191,7 +191,7 @@ def write(path: Path | str, trace: Trace) -> None:
     base = "/" + topic_of(Path(path).stem, empty="trace")
     topics = [base] if trace.traces == 1 else [f"{base}/{k}" for k in range(trace.traces)]
     origin = max(trace.meta.origin or 0, -math.floor(float(trace.times[0]) * 1e9))
-    meta = meta_array(replace(trace.meta, dt=trace.dt), trace.signature)
+    meta = replace(trace.meta, dt=trace.dt).array(trace.signature)
     properties = {
         each.name: {"type": "number"} | ({"description": each.unit.text} if each.unit.text else {})
         for each in trace.signature.columns

@@ -24,7 +24,7 @@ from stlc.files import File
 from stlc.signature import Column
 from stlc.trace.formats.arrays import Array, Arrays, no_letters
 from stlc.trace.formats.registry import damage, opened, require_room, unreadable
-from stlc.trace.meta import TraceMeta, meta_array, read_meta
+from stlc.trace.meta import TraceMeta, read_meta
 from stlc.trace.recording import ALL, EXTRA, Recording, Wanted
 from stlc.trace.trace import Trace
 
@@ -223,7 +223,7 @@ def write(path: Path | str, trace: Trace) -> None:
     """Write a trace with its extras and metadata. Raises the errors of `write_npz`."""
     arrays: dict[str, Array] = {"t": trace.times, **trace.data}
     arrays |= {f"{EXTRA}{name}": np.asarray(values) for name, values in trace.extras.items()}
-    arrays[META] = meta_array(replace(trace.meta, dt=trace.dt), trace.signature)
+    arrays[META] = replace(trace.meta, dt=trace.dt).array(trace.signature)
     write_npz(path, arrays)
 
 

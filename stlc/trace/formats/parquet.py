@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import TraceError, UsageError
+from stlc.diagnostics import TraceError, usage
 from stlc.extras import needed
 from stlc.files import File
 from stlc.signature import Column
@@ -50,7 +50,7 @@ class _Opened:
 def _open(path: Path, wanted: Wanted) -> _Opened:
     parquet = needed("pyarrow.parquet")
     if not path.is_file():
-        raise UsageError.of("U102", f"cannot read `{path}`: no such file or directory")
+        raise usage(f"cannot read `{path}`: no such file or directory", code="U102")
     found, kinds = Arrays(wanted), {}
     with damage(path):
         file = parquet.ParquetFile(path, memory_map=True)

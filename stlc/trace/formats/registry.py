@@ -20,7 +20,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from stlc.diagnostics import StlcError, TraceError, UsageError
+from stlc.diagnostics import StlcError, TraceError, usage
 from stlc.extras import needed
 from stlc.registry import PackageRegistry
 
@@ -120,7 +120,7 @@ def opened(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         why = (error.strerror or type(error).__name__).lower()
-        raise UsageError.of("U102", f"cannot read `{path}`: {why}") from None
+        raise usage(f"cannot read `{path}`: {why}", code="U102") from None
 
 
 @contextmanager

@@ -30,7 +30,7 @@ from stlc.diagnostics import (
     StlcError,
     SystemFileError,
     TraceError,
-    UsageError,
+    usage,
 )
 from stlc.version import __version__
 
@@ -80,7 +80,7 @@ FAILURES = {
     "system": (SystemFileError(Diagnostic("S101", "key")), 3, "S101"),
     "trace": (TraceError(Diagnostic("E601", "lacks")), 3, "E601"),
     "run": (RunError(Diagnostic("R102", "other")), 3, "R102"),
-    "usage": (UsageError(Diagnostic("U102", "gone")), 2, "U102"),
+    "usage": (usage("gone", code="U102"), 2, "U102"),
     "missing": (MissingError(Diagnostic("R301", "no")), 5, "R301"),
     "bad parameter": (typer.BadParameter("too large"), 2, "U101"),
     "disk full": (os_error(errno.ENOSPC, "a.npz"), 5, "R201"),

@@ -17,7 +17,7 @@ from stlc.dynamics.system import System
 from stlc.files import File
 from stlc.grammar.parser import parse
 from stlc.rundir import RunDir
-from stlc.view.held_out import load_held_out, unsolved_text
+from stlc.view.held_out import load_held_out
 
 
 def test_what_is_known_is_kept_state_by_state(car_task: Task, tmp_path: Path) -> None:
@@ -42,7 +42,7 @@ def test_what_is_known_is_kept_state_by_state(car_task: Task, tmp_path: Path) ->
     failing, known = held.unsolved
     assert failing == 60 - int(good.sum())
     assert known == int(found.known.sum()) - int(good.sum())
-    assert unsolved_text(held).startswith(f"{failing} of 60 starts; a satisfying plan is known for {known} ")
+    assert held.unsolved_text.startswith(f"{failing} of 60 starts; a satisfying plan is known for {known} ")
 
 
 def test_what_is_feasible_hardly_depends_on_the_policy() -> None:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
-from stlc.dynamics.declaration.inputs import InputDecl, Interpolate, drawn_numbers, signal_values
+from stlc.dynamics.declaration.inputs import InputDecl, Interpolate
 from stlc.units import Unit
 
 
@@ -22,7 +22,7 @@ def declared(interpolate: Interpolate, pieces: int, *, free: bool) -> InputDecl:
 
 def drawn(decl: InputDecl, count: int = 20, seed: int = 0) -> np.ndarray:
     """Random numbers of an input signal, (count, columns); half of the values are whole."""
-    numbers = drawn_numbers(decl, np.random.default_rng(seed).random((count, len(decl.columns))))
+    numbers = decl.drawn(np.random.default_rng(seed).random((count, len(decl.columns))))
     numbers[::2, : decl.points] = np.round(numbers[::2, : decl.points])
     return numbers
 
@@ -39,7 +39,7 @@ def test_signals_are_what_scipy_and_numpy_interpolate(pieces: int, free: bool) -
     for interpolate in ("hold", "linear", "pchip"):
         decl = declared(interpolate, pieces, free=free)
         numbers = drawn(decl)
-        found = signal_values(decl, numbers, times)
+        found = decl.at(numbers, times)
         assert found.shape == (20, 101)
         assert found.dtype == np.float64
         for row, values in zip(numbers, found, strict=True):
@@ -61,7 +61,7 @@ def test_a_signal_stays_within_its_values_and_after_its_duration(
     decl = declared(interpolate, pieces, free=free)
     numbers = drawn(decl, 3, seed)
     points = numbers[:, : decl.points]
-    found = signal_values(decl, numbers, np.array([-1.0, 0.0, *np.linspace(0.0, 12.0, 50)]))
+    found = decl.at(numbers, np.array([-1.0, 0.0, *np.linspace(0.0, 12.0, 50)]))
     assert (found >= points.min(1, keepdims=True) - 1e-12).all()
     assert (found <= points.max(1, keepdims=True) + 1e-12).all()
     np.testing.assert_allclose(found[:, 0], points[:, 0])
@@ -70,7 +70,7 @@ def test_a_signal_stays_within_its_values_and_after_its_duration(
 
 def test_free_times_are_sorted_uniform_times() -> None:
     decl = declared("hold", 4, free=True)
-    times = drawn_numbers(decl, np.random.default_rng(1).random((20_000, 7)))[:, 4:]
+    times = decl.drawn(np.random.default_rng(1).random((20_000, 7)))[:, 4:]
     assert (np.diff(times, axis=1) >= 0.0).all()
     np.testing.assert_allclose(times.mean(0), [2.5, 5.0, 7.5], atol=0.05)
     np.testing.assert_allclose(times[:, 0].std(), 10 * np.sqrt(3 / 80), atol=0.05)
@@ -78,15 +78,15 @@ def test_free_times_are_sorted_uniform_times() -> None:
 
 def test_numbers_at_the_corners_of_the_unit_cube() -> None:
     decl = declared("linear", 3, free=True)
-    corners = drawn_numbers(decl, np.array([[0.0] * 6, [1.0] * 6]))
+    corners = decl.drawn(np.array([[0.0] * 6, [1.0] * 6]))
     assert corners.tolist() == [[-1.0] * 4 + [10.0] * 2, [3.0] * 4 + [0.0] * 2]
-    assert np.isfinite(signal_values(decl, corners, np.linspace(0.0, 10.0, 11))).all()
+    assert np.isfinite(decl.at(corners, np.linspace(0.0, 10.0, 11))).all()
 
 
 def test_a_sample_at_a_switching_time_belongs_to_the_later_piece() -> None:
     decl = declared("hold", 10, free=False)
     steps = np.cumsum(np.full(100, 0.1))  # 0.1 + 0.1 + … misses the whole seconds by 1e-15
-    found = signal_values(decl, np.arange(10.0)[None], steps)[0]
+    found = decl.at(np.arange(10.0)[None], steps)[0]
     assert found[9::10].tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 9.0]
 
 

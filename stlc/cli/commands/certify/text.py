@@ -9,7 +9,7 @@ from stlc.assurance.bounds import floored, raised
 from stlc.diagnostics import usage
 from stlc.escape import visible
 from stlc.jsontext import plain
-from stlc.options import checked_share
+from stlc.options import Options
 
 if TYPE_CHECKING:
     from stlc.assurance.certificate import Assessment
@@ -21,7 +21,7 @@ def require_claim(share: float | None, fail_under: float | None) -> None:
     Raises:
         UsageError: U101, `share` is not between 0 and 1, or both options are given: each sets the exit code.
     """
-    if share is not None and checked_share("--certify", share) and fail_under is not None:
+    if share is not None and Options.checked_share("--certify", share) and fail_under is not None:
         raise usage("`--certify` does not go with `--fail-under`", "each of them says what the exit code is")
 
 

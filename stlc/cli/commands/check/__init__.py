@@ -17,11 +17,11 @@ from stlc.cli.commands.check import options as given
 from stlc.cli.framework.options import FailUnderOption, JsonOption, require_separate
 from stlc.cli.framework.output import QUIET, Answer, emit, say, show_diagnostics, wants_color
 from stlc.cli.framework.program import command
-from stlc.diagnostics import UsageError, usage
+from stlc.diagnostics import usage
 from stlc.escape import visible
 from stlc.files import File
 from stlc.jsontext import plain
-from stlc.options import Options, require_no_jobs
+from stlc.options import Options
 
 if TYPE_CHECKING:
     from io import BufferedReader
@@ -125,7 +125,7 @@ def check(
         from stlc.cli.commands.check.table import require_table, write_table
 
         require_table(table)
-    require_no_jobs(cluster, jobs)
+    Options.require_no_jobs(cluster, jobs)
     question = judging.question()
     if certify is not None:
         from stlc.cli.commands.certify.text import require_claim
@@ -259,14 +259,14 @@ def _bounded(outcomes: Sequence[Outcome], share: float, code: int) -> tuple[int,
 
     The code is that of the answer, or `code` if a file cannot be judged; 4 if no trace is in scope.
     """
-    from stlc.assurance.certificate import Claim, assess, joined, sample_of_traces
+    from stlc.assurance.certificate import Claim, joined, sample_of_traces
     from stlc.cli.commands.check.many import INCONCLUSIVE, INVALID
 
     samples = [sample for each in outcomes if each.verdict and (sample := sample_of_traces(each.verdict))]
     if not samples:
         return (code if code >= INVALID else INCONCLUSIVE), None
     try:
-        found = assess(joined(samples), Claim(share))
+        found = joined(samples).assess(Claim(share))
     except ValueError as error:
         raise usage(f"`--certify`: {error}", "--spec SPEC judges all traces by one specification") from None
     return (code if any(outcome.errors for outcome in outcomes) else found.exit_code), found
@@ -336,7 +336,7 @@ def _expanded(names: Sequence[str], written: Sequence[Path]) -> list[str]:
             if match not in known and not File(match).is_spec and own.isdisjoint(places):
                 found.append(match)
     if not found:
-        raise UsageError.of("U102", f"no trace matches `{names[0]}`")
+        raise usage(f"no trace matches `{names[0]}`", code="U102")
     return found
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from stlc.cli.commands.check.options import Judging
-from stlc.diagnostics import StlcError, UsageError, usage
+from stlc.diagnostics import StlcError, usage
 from stlc.files import File
 from stlc.jsontext import dumps
 from stlc.monitor.check import Question, monitor_of
@@ -120,7 +120,7 @@ def _result(path: Path) -> Mapping[str, Any]:
         if not isinstance(result, dict) or not isinstance(result.get("files", []), list):
             raise TypeError("its result is no record")
     except OSError as error:
-        raise UsageError.of("U102", f"`{path}` cannot be read: {error}") from None
+        raise usage(f"`{path}` cannot be read: {error}", code="U102") from None
     except (ValueError, TypeError, LookupError, RecursionError) as error:
         message = f"`{path}` is no output of `stlc check --json`: {error}"
         raise usage(message, "stlc check SPEC TRACE --json > RESULT.json") from None
@@ -132,6 +132,6 @@ def _require_same(result: Path, name: str, digest: str) -> None:
     path = Path(name)
     if not (path.is_file() or path.is_dir()):
         message = f"`{name}`, from which {result} was made, is not here"
-        raise UsageError.of("U102", message, help=("run it in the folder of the first check",))
+        raise usage(message, "run it in the folder of the first check", code="U102")
     if _file(path).sha256 != digest:
-        raise UsageError.of("U102", f"`{name}` has changed since {result} was made")
+        raise usage(f"`{name}` has changed since {result} was made", code="U102")

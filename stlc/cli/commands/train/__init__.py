@@ -18,7 +18,7 @@ from stlc.cli.framework.output import Answer, say, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.controller.training.budget import StepSchedule
 from stlc.controller.training.options import TrainOptions
-from stlc.diagnostics import MissingError, StlcError, UsageError, usage
+from stlc.diagnostics import MissingError, StlcError, usage
 from stlc.options import Option, Options, parse_seeds
 from stlc.registry import METHODS
 from stlc.rundir import RunDir
@@ -181,7 +181,7 @@ def _train(task: Task, config: TrainConfig, launch: Launch, logger: Opener | Non
     from stlc.cli.commands.train.session import Session
     from stlc.controller.parallel.ddp import joined
     from stlc.controller.training.launch import open_folder
-    from stlc.controller.training.loop import prepare, run
+    from stlc.controller.training.loop import prepare
     from stlc.stopping import age
 
     with joined(config.device) as ranks:
@@ -190,7 +190,7 @@ def _train(task: Task, config: TrainConfig, launch: Launch, logger: Opener | Non
         made = str(open_folder(task, config, launch).path) if ranks.first else ""
         folder = RunDir(Path(ranks.agree_text(made)))
         with Session(folder, logger=logger, writes=ranks.first, before=before, new=True) as session:
-            session.outcome = run(prepared, folder, session.watch)
+            session.outcome = prepared.run(folder, session.watch)
     return session
 
 
@@ -231,7 +231,7 @@ def _refuse_on_resume(own: Mapping[str, object], changed: Mapping[str, object]) 
     if named:
         message = f"{', '.join(named)} cannot change when a run is resumed"
         advice = ("stlc train --resume RUN [--steps N | --budget TIME]", "a new run takes any option")
-        raise UsageError.of("R104", message, help=advice)
+        raise usage(message, *advice, code="R104")
 
 
 # ------------------------------------------------------------------- several ranks

@@ -215,19 +215,19 @@ def _screen(outcome: TrainingOutcome, result: TrainedRun, spark: str, pictures: 
     The lines describe the held-out initial states (never used in training) from which the requirement with
     most violations fails. With `pictures`, the path of a picture of these states is added.
     """
-    from stlc.view.held_out import find_weakness, load_held_out, unsolved_text, weakness_text
+    from stlc.view.held_out import load_held_out
 
     folder = outcome.run.dir
     held = load_held_out(folder)
-    weakness = None if held is None else find_weakness(held)
+    weakness = None if held is None else held.weakness()
     if held is None or weakness is None:
         return final_screen(result, spark)
     drawn = pictures and folder.has(FAILURES)
     return final_screen(
         result,
         spark,
-        region=weakness_text(weakness, held, outcome.run.task.system.signature),
-        unsolved=unsolved_text(held),
+        region=weakness.text(held, outcome.run.task.system.signature),
+        unsolved=held.unsolved_text,
         picture=f"{folder.shown}/{FAILURES}" if drawn else "",
     )
 

@@ -25,7 +25,7 @@ from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.options import bounded
 from stlc.controller.search.local_search import Searcher
 from stlc.controller.search.starts import extremes
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import usage
 from stlc.extras import needed
 from stlc.native import Stop
 
@@ -253,12 +253,7 @@ def _encoded(
                 encoding.model.limit(rho, factor * encoding.model.most(tree))
             encoding.model.imply(ZERO, tree)
     except UnencodableError as what:
-        finding = Diagnostic(
-            "U101",
-            f"planner `milp` cannot encode {what}",
-            help=("search plans for any system",),
-        )
-        raise UsageError(finding) from None
+        raise usage(f"planner `milp` cannot encode {what}", "search plans for any system") from None
     return encoding, rho.times(-1.0) if maximise else ZERO
 
 
