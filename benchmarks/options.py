@@ -12,7 +12,7 @@ import typer
 from stlc.cli.framework.options import JsonOption
 from stlc.diagnostics import usage
 from stlc.options import parse_clock, parse_seconds, parse_seeds
-from stlc.registry import closest
+from stlc.similar import closest
 
 if TYPE_CHECKING:
     from benchmarks.training import Length, Place

@@ -17,7 +17,7 @@ from stlc.files import File, alone_in
 from stlc.grammar.parser import parse
 from stlc.jsontext import dumps, plain
 from stlc.provenance import git_state, hardware, sha256, versions
-from stlc.rundir import now
+from stlc.rundir import RunDir
 
 FORMAT = "benchmark-results/1"
 RESULTS = Path("benchmarks/results")
@@ -105,7 +105,7 @@ class ResultStore:
 
 def made_here() -> dict[str, Any]:
     """Return the provenance of a result that is computed now: date, software versions, commit and machine."""
-    return {"date": now(), "versions": versions(), "git": git_state(), "hardware": hardware()}
+    return {"date": RunDir.now(), "versions": versions(), "git": git_state(), "hardware": hardware()}
 
 
 # ----------------------------------------------------------------------- tasks

@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, Self
 
+from stlc.similar import did_you_mean
 from stlc.source import Label, Range, Span
 
 Severity = Literal["error", "warning", "fact"]
@@ -89,6 +90,15 @@ class Diagnostic:
         """Lines and columns of the location, from 1."""
         return None if self.span is None else self.span.range
 
+    def near(self, name: str, candidates: Iterable[str], *otherwise: str, listed: str = "") -> Diagnostic:
+        """A copy whose advice begins with the candidate that is most similar to a misspelt name.
+
+        If none is similar, it begins with the texts `otherwise`. `listed` follows in the same line.
+        """
+        found = did_you_mean(name, candidates, *otherwise)
+        first = ("  ".join((*found, listed)),) if listed else found
+        return replace(self, help=(*first, *self.help))
+
     def with_note(self, text: str) -> Diagnostic:
         """A copy with one more note."""
         return replace(self, note=(*self.note, text))
@@ -152,6 +162,11 @@ class StlcError(Exception):
     ) -> Self:
         """Return the error with one finding, whose parts are those of `Diagnostic`."""
         return cls(Diagnostic(code, message, span, label, labels, help, note))
+
+    def near(self, name: str, candidates: Iterable[str], *otherwise: str, listed: str = "") -> Self:
+        """The error with the advice of `Diagnostic.near` in its first finding."""
+        first, *rest = self.diagnostics
+        return type(self)(first.near(name, candidates, *otherwise, listed=listed), *rest)
 
     def __str__(self) -> str:
         return "\n".join(

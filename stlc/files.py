@@ -18,7 +18,7 @@ from typing import BinaryIO, ClassVar
 
 from stlc.diagnostics import Diagnostic, MissingError, RunError, SpecError, UsageError, os_reason, usage
 from stlc.escape import operand, shell
-from stlc.registry import closest
+from stlc.similar import closest
 from stlc.source import Source
 from stlc.stopping import leaving
 

@@ -36,8 +36,6 @@ Chosen = TypeVar("Chosen")
 Result = TypeVar("Result")
 Clock = Literal["wall", "processor"]
 """Clock of a budget: wall time, or processor time as on an idle machine."""
-MOST_SEED = 2**63 - 1
-"""Greatest seed of torch's random numbers."""
 
 
 _ENTRY = re.compile(r"^ {4}(\w+)(?: \((.+)\))?: (.+(?:\n {8}.*)*)", re.MULTILINE)
@@ -187,6 +185,8 @@ class Options:
     """Base class of the options of an operation, and the types of options that several operations have."""
 
     __slots__ = ()
+    MOST_SEED: ClassVar = 2**63 - 1
+    """Greatest seed of torch's random numbers."""
     SET = Option("Change a constant of the spec or a key of the system.", "NAME=VALUE", ("--set",), many=True)
     REQUIRE = Option(
         "This requirement only; repeatable.", "NAME", ("--require",), many=True, names="requirement_names"

@@ -39,7 +39,6 @@ from stlc.files import (
 from stlc.jsontext import data_of, dumps
 from stlc.provenance import sha256
 from stlc.records import read
-from stlc.registry import did_you_mean
 from stlc.source import Source
 
 Status = Literal["running", "finished", "interrupted", "failed"]
@@ -138,6 +137,7 @@ class RunDir:
     """Folder of all runs."""
     LATEST: ClassVar = "latest"
     ROWS: ClassVar = "train.jsonl"
+    CONFIG: ClassVar = "config.resolved.yaml"
     SPEC: ClassVar = "spec.stl"
     SYSTEM: ClassVar = "system.yaml"
     TRACE: ClassVar = "trace.npz"
@@ -170,7 +170,7 @@ class RunDir:
             UsageError: U101, `words` cannot be part of a folder's name.
             MissingError: R201, the folder cannot be created.
         """
-        words = require_name(words) if words is not None else draw_words()
+        words = cls.require_name(words) if words is not None else draw_words()
         home = root / _slug(spec_name)
         with reported(f"make a run below `{root}`"):
             home.mkdir(parents=True, exist_ok=True)
@@ -279,6 +279,18 @@ class RunDir:
                 newest = max(left, key=lambda entry: entry.path.stat().st_mtime)
                 _point(link, newest.path.relative_to(folder).as_posix())
 
+    @staticmethod
+    def now() -> str:
+        """The current time in UTC, in the format of run records and traces."""
+        return datetime.now(UTC).isoformat(timespec="seconds")
+
+    @staticmethod
+    def require_name(words: str) -> str:
+        """Return the name of a run; raise UsageError (U101) if no folder can have it."""
+        if _slug(words) != words:
+            raise usage(f"`{words}` cannot name a run", "use letters, digits, `-`, `_` and `.`")
+        return words
+
     def checked(self) -> RunDir:
         """Return this run if its record (`run.json`) can be read. Raises RunError (R101) if not."""
         self.record()
@@ -378,7 +390,7 @@ class RunDir:
 
     def finish(self, status: Status, result: object = None) -> None:
         """Write status, end time and, if given, the result of the run to `run.json`."""
-        ended = {"status": status, "finished": now()}
+        ended = {"status": status, "finished": self.now()}
         self.update(ended if result is None else {**ended, "result": result})
 
     def claimed(self) -> AbstractContextManager[bool]:
@@ -482,11 +494,6 @@ def _resolved(folder: Path) -> RunDir:
     return RunDir(path)
 
 
-def now() -> str:
-    """The current time in UTC, in the format of run records and traces."""
-    return datetime.now(UTC).isoformat(timespec="seconds")
-
-
 # ---------------------------------------------------------------------- names
 
 
@@ -502,8 +509,7 @@ def _by_name(where: str, root: Path) -> RunDir:
         choices = tuple(f"{run.path.parent.name}/{run.name}" for run in fitting)
         raise usage(f"several runs are called `{where}`", *choices, code="R101")
     names = {name for run in runs for name in (run.name, _names(run)[-1], run.path.parent.name)}
-    advice = did_you_mean(where, names)
-    raise usage(f"there is no run `{where}` in `{root}`", *advice, code="R101")
+    raise usage(f"there is no run `{where}` in `{root}`", code="R101").near(where, names)
 
 
 def _of_spec(path: Path, root: Path) -> RunDir:
@@ -544,13 +550,6 @@ def _slug(name: str) -> str:
     """Part of a path for the name of a specification or run; never that of the link `latest`."""
     part = file_part(name, empty="spec")
     return f"{part}-spec" if part.lower() == RunDir.LATEST else part
-
-
-def require_name(words: str) -> str:
-    """Return the name of a run; raise UsageError (U101) if no folder can have it."""
-    if _slug(words) != words:
-        raise usage(f"`{words}` cannot name a run", "use letters, digits, `-`, `_` and `.`")
-    return words
 
 
 # ---------------------------------------------------------------------- the file system

@@ -18,7 +18,7 @@ PACKAGES = (ROOT / "stlc", ROOT / "benchmarks")
 
 # From the bottom up; what stands in one line is one room.
 ROOMS = (
-    {"source", "version", "stopping"},
+    {"source", "version", "stopping", "similar"},
     {"diagnostics"},
     {"escape"},
     {"activity", "options", "plugins", "registry", "units", "jsontext", "records", "extras", "tabular"},

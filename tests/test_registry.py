@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stlc.diagnostics import UsageError
-from stlc.registry import PackageRegistry, Registry, closest
+from stlc.registry import PackageRegistry, Registry
+from stlc.similar import closest
 
 words = st.text("abcdefgh_", min_size=4, max_size=10)
 

@@ -29,7 +29,7 @@ from stlc.options import Options
 from stlc.provenance import hardware, versions
 from stlc.records import read
 from stlc.registry import GUARDS
-from stlc.rundir import RunDir, now
+from stlc.rundir import RunDir
 
 if TYPE_CHECKING:
     from stlc.assurance.campaign import Subject
@@ -64,7 +64,7 @@ class Certificate:
     path: Path | None = None
     shown: str = ""
     certificate: Literal["stlc-certificate/1"] = FORMAT
-    made: str = field(default_factory=now)
+    made: str = field(default_factory=RunDir.now)
     versions: dict[str, str]
     hardware: dict[str, Any] = field(default_factory=hardware)
 

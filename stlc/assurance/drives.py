@@ -27,8 +27,8 @@ from stlc.controller.evaluation.executed import executed_robustness
 from stlc.controller.evaluation.rules import Rules
 from stlc.controller.guard.guard import Guard
 from stlc.controller.problem.task import Task
-from stlc.controller.run.checkpoint import FOLDER, POINTER, CheckpointHead
-from stlc.controller.run.run import CONFIG, Run
+from stlc.controller.run.checkpoint import newest_tensors
+from stlc.controller.run.run import Run
 from stlc.controller.world import independent_agents, world_type
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.jsontext import plain
@@ -204,8 +204,5 @@ def verify(stored: StoredCertificate, folder: RunDir) -> CertificateVerification
 
 def _policy(folder: RunDir) -> str:
     """Hash of the tensors of the newest checkpoint, if there is one, and of the resolved options."""
-    parts = [folder.read(CONFIG)]
-    if folder.has(f"{FOLDER}/{POINTER}"):
-        name = folder.read_json(f"{FOLDER}/{POINTER}", CheckpointHead)["file"]
-        parts.append(folder.read(f"{FOLDER}/{name}", RunDir.MOST_ARRAYS))
+    parts = [folder.read(RunDir.CONFIG), *newest_tensors(folder)]
     return sha256(b"\0".join(sha256(part).encode() for part in parts))

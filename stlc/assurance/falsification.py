@@ -30,7 +30,7 @@ from stlc.escape import file_part
 from stlc.files import File
 from stlc.jsontext import data_of, dumps
 from stlc.monitor.judgement import require_known
-from stlc.options import MOST_SEED, Options
+from stlc.options import Options
 from stlc.plants.plant import PlantFinding
 from stlc.records import read
 from stlc.registry import GUARDS
@@ -319,7 +319,7 @@ def _stored(path: Path) -> StoredCounterexample | StoredFinding:
             or "\0" in stored.trace
         ):
             raise ValueError("`margin` or `trace` is not what stlc writes")
-        if stored.settings.seed > MOST_SEED:
+        if stored.settings.seed > Options.MOST_SEED:
             raise ValueError("`settings.seed` is too large")
     except (SpecError, ValueError, RecursionError) as error:
         help_, why = ("a file that `stlc falsify` wrote",), str(error)[:200]

@@ -12,7 +12,6 @@ from stlc.activity import PULSE
 from stlc.assurance.plant_judge import JudgedRun, PlantJudge, PlantSimulation
 from stlc.diagnostics import notice, usage
 from stlc.escape import visible
-from stlc.registry import did_you_mean
 from stlc.trace import Trace
 
 if TYPE_CHECKING:
@@ -90,7 +89,7 @@ def _assignments(plant: Plant, text: str) -> Iterator[tuple[str, float]]:
         if not meant:
             known = [each.name for each in plant.variables]
             listed = f"variables: {', '.join(known)}" if known else "all its values are fixed"
-            raise usage(f"`{plant.decl.name}` has no variable `{name}`", *did_you_mean(name, known), listed)
+            raise usage(f"`{plant.decl.name}` has no variable `{name}`", listed).near(name, known)
         for variable in meant:
             yield variable.name, _value(variable, part.strip(), value)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from stlc.assurance.search_space import Point, SearchSpace
 from stlc.assurance.simulation import Simulations, Simulator, SimulatorSource
-from stlc.controller.parallel.workers import NO_FILES, CallFiles, CallWorkers, LostCall, results
+from stlc.controller.parallel.workers import NO_FILES, CallFiles, CallWorkers, LostCall
 
 if TYPE_CHECKING:
     from stlc.assurance.plant_simulator import FailedSimulation
@@ -66,7 +66,7 @@ class SimulatorWorkers:
         orders = [_Order(self._source, task, argument) for argument in arguments]
         ended: dict[int, Any] = {}
         following = 0
-        for each in results(self._calls, _call, orders, files=lambda _: self._files):
+        for each in self._calls.results(_call, orders, files=lambda _: self._files):
             ended[each.index] = each.value
             while following in ended:
                 found = ended.pop(following)

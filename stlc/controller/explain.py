@@ -10,7 +10,6 @@ from stlc.diagnostics import CODES, usage
 from stlc.files import File
 from stlc.grammar import ast
 from stlc.grammar.manual import CodeList, Page, SpecInWords, in_words, read_page
-from stlc.registry import did_you_mean
 from stlc.rundir import RunDir
 
 if TYPE_CHECKING:
@@ -70,8 +69,8 @@ def explain(
     if _CODE.fullmatch(name) or name in _TOPICS:
         page = read_page(name if name in _TOPICS else name.upper())
         if page is None:
-            advice = did_you_mean(name.upper(), CODES, "stlc explain  lists the codes")
-            raise usage(f"there is no code `{name.upper()}`", *advice)
+            missing = usage(f"there is no code `{name.upper()}`")
+            raise missing.near(name.upper(), CODES, "stlc explain  lists the codes")
         return page
     if name == File.STDIN or File(name).is_spec:
         from stlc.grammar.parser import parse

@@ -22,7 +22,6 @@ from stlc.dynamics.declaration.deployment import WorldRef
 from stlc.dynamics.system import System
 from stlc.dynamics.uncertainty.disturbance import Events
 from stlc.foreign import module_at
-from stlc.registry import did_you_mean
 
 
 class World(Protocol):
@@ -219,21 +218,18 @@ def _load(reference: WorldRef) -> WorldType:
     found = getattr(module, name, None)
     if not isinstance(found, type):
         classes = [key for key, value in vars(module).items() if isinstance(value, type)]
-        raise _refused(reference, f"`{path}` has no class `{name}`", advice=did_you_mean(name, classes))
+        raise _refused(reference, f"`{path}` has no class `{name}`").near(name, classes)
     missing = [method for method in _METHODS if not callable(getattr(found, method, None))]
     if missing:
         raise _refused(reference, f"`{name}` in `{path}` is no world: it lacks {', '.join(missing)}")
     return cast(WorldType, found)
 
 
-def _refused(
-    reference: WorldRef, message: str, note: str = "", advice: tuple[str, ...] = ()
-) -> SystemFileError:
+def _refused(reference: WorldRef, message: str, note: str = "") -> SystemFileError:
     return SystemFileError.of(
         "S206",
         message,
         reference.span,
         label="named here",
         note=(note,) if note else (),
-        help=advice,
     )

@@ -16,7 +16,6 @@ from stlc.diagnostics import SystemFileError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.functions import FunctionDecl
 from stlc.foreign import module_at, require_driving
-from stlc.registry import did_you_mean
 
 
 def load_functions(decl: SystemDecl) -> Mapping[str, InterfaceFunction]:
@@ -46,16 +45,14 @@ def _loaded(decl: FunctionDecl) -> Callable[..., Array]:
     found = getattr(module, decl.attribute, None)
     if not callable(found):
         functions = [name for name, value in vars(module).items() if callable(value)]
-        advice = did_you_mean(decl.attribute, functions)
-        raise _refused(decl, f"`{decl.module}` has no function `{decl.attribute}`", help_=advice)
+        missing = _refused(decl, f"`{decl.module}` has no function `{decl.attribute}`")
+        raise missing.near(decl.attribute, functions)
     return found  # type: ignore[no-any-return]
 
 
-def _refused(
-    decl: FunctionDecl, message: str, note: str = "", help_: tuple[str, ...] = ()
-) -> SystemFileError:
+def _refused(decl: FunctionDecl, message: str, note: str = "") -> SystemFileError:
     notes = (note,) if note else ()
-    return SystemFileError.of("S208", message, decl.span, "named here", help=help_, note=notes)
+    return SystemFileError.of("S208", message, decl.span, "named here", note=notes)
 
 
 @final

@@ -16,7 +16,6 @@ from stlc.diagnostics import usage
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.deployment import ErrorsDecl, ScenarioDecl
 from stlc.dynamics.load import load_system_decl, parse_system
-from stlc.registry import did_you_mean
 from stlc.source import Source
 
 DISTURBED = ("mismatch-5", "mismatch-10", "mismatch-20", "disturb", "noise")
@@ -60,10 +59,10 @@ def find_scenario(decl: SystemDecl, name: str, *advice: str) -> ScenarioDecl:
     if (usual := standard(name)) is not None:
         return usual
     names = [scenario.name for scenario in decl.scenarios]
-    near = did_you_mean(name, [*names, *DISTURBED, "mismatch"])
     listed = f"scenarios of {decl.name}: {', '.join(names)}" if names else f"{decl.name} declares none"
     every = f"every system has {', '.join(DISTURBED)}"
-    raise usage(f"there is no scenario `{name}`", "  ".join((*near, listed)), every, *advice)
+    missing = usage(f"there is no scenario `{name}`", every, *advice)
+    raise missing.near(name, [*names, *DISTURBED, "mismatch"], listed=listed)
 
 
 def scenario_constants(

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 from stlc.diagnostics import CODES, Diagnostic
 from stlc.grammar.scan import comments, declaration_starts, lexemes
-from stlc.registry import did_you_mean
 from stlc.source import Source, Span
 
 _DIRECTIVE = re.compile(r"(?:#+|/{2,})[ \t]*stlc:[ \t]*(?P<word>\w*)(?P<codes>(?:[ \t,]+[A-Za-z]\d+\b)*)")
@@ -69,8 +68,8 @@ def misunderstood(source: Source) -> Iterator[Diagnostic]:
         for code in codes:
             known = code.text.upper()
             if known not in CODES:
-                advice = did_you_mean(known, CODES, "stlc explain  lists the codes")
-                yield Diagnostic("W319", f"there is no code `{known}`", code, help=advice)
+                missing = Diagnostic("W319", f"there is no code `{known}`", code)
+                yield missing.near(known, CODES, "stlc explain  lists the codes")
             elif not known.startswith("W"):
                 yield Diagnostic("W319", f"`{known}` is an error; only warnings can be allowed", code)
 

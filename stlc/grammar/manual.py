@@ -11,7 +11,6 @@ from typing import ClassVar, Literal
 from stlc.diagnostics import usage
 from stlc.grammar import ast
 from stlc.grammar.english import Meanings
-from stlc.registry import did_you_mean
 
 FOLDER = Path(__file__).parents[1] / "pages"
 _FENCE = re.compile(r"^```(?P<language>\w*)(?P<notes>[^\n]*)\n(?P<body>.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -97,8 +96,8 @@ def in_words(spec: ast.Spec, name: str, wanted: Sequence[str] = ()) -> SpecInWor
     items = [item for item in spec.items if isinstance(item, ast.Require | ast.Assume)]
     for one in wanted:
         if one not in [item.name for item in items]:
-            advice = did_you_mean(one, [item.name for item in items])
-            raise usage(f"`{name}` has no requirement `{one}`", *advice)
+            missing = usage(f"`{name}` has no requirement `{one}`")
+            raise missing.near(one, [item.name for item in items])
     meanings = Meanings(spec)
     found = [
         RequirementInWords(

@@ -18,7 +18,6 @@ from stlc.grammar.allow import not_allowed
 from stlc.grammar.parser import parse
 from stlc.lint.meaning import TYPED_RULES
 from stlc.lint.rules import RULES
-from stlc.registry import did_you_mean
 from stlc.source import Source, Span
 
 Edit: TypeAlias = tuple[Span, str]
@@ -110,8 +109,8 @@ class Selection:
     def __post_init__(self) -> None:
         for prefix in (*self.select, *self.ignore):
             if prefix != "ALL" and not any(code.startswith(prefix) for code in CODES):
-                advice = did_you_mean(prefix, CODES, "stlc explain  lists the codes")
-                raise usage(f"there is no code `{prefix}`", *advice)
+                missing = usage(f"there is no code `{prefix}`")
+                raise missing.near(prefix, CODES, "stlc explain  lists the codes")
 
     def wants(self, code: str) -> bool:
         """True if findings with this code are to be reported."""

@@ -22,7 +22,6 @@ from stlc.monitor.facts.fact import Fact
 from stlc.monitor.prepared import Floats, Part, Prepared, Timeline
 from stlc.monitor.signals import Gap
 from stlc.provenance import sha256
-from stlc.registry import did_you_mean
 from stlc.source import Source
 from stlc.tabular import frame, html_table, plot
 from stlc.trace.recording import Clock
@@ -514,6 +513,11 @@ class Verdict:
         return {name: cause for name, cause in found.items() if cause is not None}
 
     @property
+    def worst(self) -> RequirementVerdict:
+        """The verdict with the least weighted lower bound on its robustness."""
+        return worst_of(self)
+
+    @property
     def violated(self) -> list[RequirementVerdict]:
         """The verdicts on the requirements that are violated."""
         return [each for each in self.requirements if each.overall == "violated"]
@@ -728,11 +732,8 @@ def require_known(names: Sequence[str], known: Sequence[str]) -> None:
         raise usage("requirements are a list of names", f'["{names}"]')
     for name in names:
         if name not in known:
-            raise usage(
-                f"there is no requirement `{name}`",
-                *did_you_mean(name, known),
-                note=(f"requirements: {', '.join(known)}",),
-            )
+            note = (f"requirements: {', '.join(known)}",)
+            raise usage(f"there is no requirement `{name}`", note=note).near(name, known)
 
 
 def _known(status: Status) -> bool | None:

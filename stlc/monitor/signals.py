@@ -29,8 +29,8 @@ from stlc.escape import shell, visible
 from stlc.grammar import ast
 from stlc.monitor.cells import Cells
 from stlc.monitor.given import CLOCKS, UNNAMED, Given
-from stlc.registry import closest, did_you_mean
 from stlc.signature import Column, Kind
+from stlc.similar import closest
 from stlc.source import Span
 from stlc.trace import AS_IT_IS, Reading, Trace
 from stlc.trace.enums import Words
@@ -144,10 +144,9 @@ def _require_signals(requested: Reading, spec: ast.Spec, columns: Mapping[str, s
     for option, names in (("--map", requested.names), ("--between", requested.between)):
         for name in names:
             if name not in known and name.partition("[")[0] not in known:
-                help_ = did_you_mean(name, declared)
                 note = (f"signals: {', '.join(declared)}",)
                 message = f"`{option} {name}=…`: the specification has no signal `{name}`"
-                findings.append(Diagnostic("U101", message, help=help_, note=note))
+                findings.append(Diagnostic("U101", message, note=note).near(name, declared))
     if findings:
         raise UsageError(*findings)
 

@@ -24,7 +24,6 @@ from stlc.diagnostics import Diagnostic, UsageError
 from stlc.grammar import ast
 from stlc.jsontext import Num
 from stlc.monitor.values import Record
-from stlc.registry import did_you_mean
 from stlc.signature import Column
 from stlc.units import Unit
 
@@ -129,9 +128,9 @@ def _misfit(
     vectors = {_INDEX.sub("", key): column for key, column in columns.items()}
     known = columns.get(name) or vectors.get(name)
     if known is None:
-        help_ = did_you_mean(name, {**columns, **vectors})
         note = (f"signals: {', '.join(columns)}",)
-        return Diagnostic("U101", f"`--uncertain {name}=…`: no signal `{name}`", help=help_, note=note)
+        missing = Diagnostic("U101", f"`--uncertain {name}=…`: no signal `{name}`", note=note)
+        return missing.near(name, {**columns, **vectors})
     signals = (item for item in spec.items if isinstance(item, (ast.Signal, ast.Param)))
     span = next((item.name_span for item in signals if item.name == _INDEX.sub("", name)), None)
     label = "declared here" if span else ""

@@ -39,7 +39,7 @@ from stlc.dynamics.declaration.schema.yaml_nodes import Mapping as MappingNode
 from stlc.files import File
 from stlc.plants.kind import KINDS, ControllerLayout, Layout, PlantKind, Port
 from stlc.source import Source, Span
-from stlc.trace.trace import RESERVED
+from stlc.trace import Trace
 from stlc.units import Unit
 
 VERSION = 1
@@ -428,7 +428,7 @@ class _Reading:
         names = Names()
         for index, entry in enumerate(self.reader.entries(node, f"`{section}`")):
             name = entry.key.text
-            if name in RESERVED:
+            if name in Trace.RESERVED:
                 message = f"`{name}` cannot be the name of a signal: traces use it"
                 self.reader.report("S103", message, entry.key.span, "choose another name, and give `from`")
             elif names.declare(entry.key, f"name in `{section}`", self.reader):

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
-from stlc.registry import did_you_mean
 from stlc.trace.formats.cells import value_of
 from stlc.trace.recording import ClockGroup, Recording
 
@@ -108,11 +107,10 @@ def _worth(word: str, words: Words) -> float | None:
 def _unknown(trace: str, name: str, word: str, words: Words) -> Diagnostic:
     shown = word if len(word) <= 40 else f"{word[:40]}…"
     if not words:
-        advice: tuple[str, ...] = (
+        advice = (
             "truth values are written as true and false, or as 1 and 0",
             f"words need an enum in the specification: enum Kind {{ … }}  and  signal {name} : Kind",
         )
         return Diagnostic("E603", f"`{name}` in `{trace}` holds words (`{shown}`), not numbers", help=advice)
     note = (f"it is one of {', '.join(words)}, or a number",)
-    advice = did_you_mean(word, words)
-    return Diagnostic("E603", f"`{name}` in `{trace}` cannot be `{shown}`", help=advice, note=note)
+    return Diagnostic("E603", f"`{name}` in `{trace}` cannot be `{shown}`", note=note).near(word, words)

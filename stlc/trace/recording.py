@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
-from stlc.registry import did_you_mean
 from stlc.signature import Column
 from stlc.source import Span
 from stlc.trace.meta import TraceMeta
@@ -218,9 +217,8 @@ def absent(trace: str, signal: str, known: Iterable[str]) -> Diagnostic:
     return Diagnostic(
         "E601",
         f"trace `{trace}` has no signal `{signal}`",
-        help=did_you_mean(signal, names),
         note=(f"signals in {trace}: {', '.join(names[:_SHOWN])}{', …' if len(names) > _SHOWN else ''}",),
-    )
+    ).near(signal, names)
 
 
 def unit_of(path: Path | str, name: str, text: str) -> Unit:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 from zipfile import is_zipfile
 
 import numpy as np
@@ -51,8 +51,6 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 
-RESERVED = ("t", "meta")
-
 
 @dataclass(frozen=True, slots=True)
 class Trace:
@@ -91,6 +89,9 @@ class Trace:
     others: tuple[str, ...] = ()
     sources: Mapping[str, str] = field(default_factory=dict)
     labels: Mapping[str, int] = field(default_factory=dict)
+
+    RESERVED: ClassVar = ("t", "meta")
+    """Names that signals cannot have."""
 
     def __repr__(self) -> str:
         size = f"{self.traces} x {self.samples} samples of {len(self.signature)} signals"
@@ -133,7 +134,7 @@ class Trace:
             MissingError: R201, no space left or no permission; an existing file is not changed.
         """
         self.check_writable(path)
-        taken = [name for name in self.data if name in RESERVED or name.startswith(EXTRA)]
+        taken = [name for name in self.data if name in self.RESERVED or name.startswith(EXTRA)]
         if taken:
             raise TraceError.of("E605", f"a recorded signal cannot be called `{taken[0]}`")
         format_of(Path(path)).function("write")(path, self)

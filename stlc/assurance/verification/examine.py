@@ -21,7 +21,7 @@ from stlc.assurance.verification.forms import Bools, Floats
 from stlc.assurance.verification.judged import PROVED
 from stlc.assurance.verification.subject import Indices, VerificationSubject
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.parallel.workers import CallWorkers, LostCall, results
+from stlc.controller.parallel.workers import CallWorkers, LostCall
 
 POINTS = 8
 """States that are sampled in each box: its centre and others at random."""
@@ -254,7 +254,7 @@ class SharedExaminer:
         ended: dict[int, list[BatchResult] | LostCall] = {}
         sent: list[int] = []
         following = 0
-        for each in results(self._calls, _call, self._orders(batches, sent)):
+        for each in self._calls.results(_call, self._orders(batches, sent)):
             ended[each.index] = each.value
             while following in ended:
                 found = ended.pop(following)

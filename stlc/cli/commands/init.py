@@ -16,7 +16,6 @@ from stlc.cli.framework.program import command
 from stlc.diagnostics import usage
 from stlc.escape import operand, shell, visible
 from stlc.files import File
-from stlc.registry import did_you_mean
 
 if TYPE_CHECKING:
     from stlc.dynamics.declaration.decl import SystemDecl
@@ -159,8 +158,8 @@ def _example_files(name: str) -> dict[str, str]:
     """
     specs = [path for path, system in _pairs() if name in (system.removesuffix(".yaml"), path.stem)]
     if not specs:
-        advice, note = did_you_mean(name, examples()), (f"there are {', '.join(examples())}",)
-        raise usage(f"there is no example `{name}`", *advice, note=note)
+        note = (f"there are {', '.join(examples())}",)
+        raise usage(f"there is no example `{name}`", note=note).near(name, examples())
     files: dict[str, str] = {}
     judges = [
         File.SPECS / judge for _, system in _pairs(specs) for judge in _JUDGE.findall(_installed(system))

@@ -11,7 +11,6 @@ from stlc.cli.framework.output import Document, emit
 from stlc.cli.framework.program import command
 from stlc.cli.framework.results import RESULTS, result_of
 from stlc.diagnostics import usage
-from stlc.registry import did_you_mean
 
 SYSTEM_FILE, PLANT_FILE, LINE = "system-file", "plant-file", "robustness-line"
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -53,8 +52,8 @@ def load_schema(name: str) -> dict[str, Any]:
     """
     wanted = name if "/" in name else f"{name}/1"
     if wanted not in names():
-        advice = did_you_mean(wanted, names(), "stlc schema  lists them")
-        raise usage(f"there is no schema `{name}`", *advice)
+        missing = usage(f"there is no schema `{name}`")
+        raise missing.near(wanted, names(), "stlc schema  lists them")
     command = wanted.partition("/")[0]
     if command == SYSTEM_FILE:
         from stlc.dynamics.declaration.sections import system_schema

@@ -29,8 +29,8 @@ from stlc.compile.ir.functions import FUNCTIONS, callable_names, sampler_names
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.grammar.words import BUILT_IN
-from stlc.registry import closest, did_you_mean
 from stlc.signature import Column, Kind, Role
+from stlc.similar import closest
 from stlc.source import Span
 from stlc.units import Unit, nearest
 
@@ -123,15 +123,14 @@ def _check_extern_type(written: ast.TypeRef, scope: Scope) -> None:
 
 
 def _absent_function(item: ast.Extern, interface: Interface) -> Diagnostic:
-    hint = did_you_mean(item.name, interface.externs)
     line = f'functions: {{{item.name}: {{kind: python, target: "package.module:{item.name}"}}}}'
     return Diagnostic(
         "E107",
         f"the system provides no function `{item.name}`",
         item.name_span,
         f"declared here, absent from {interface.where}",
-        help=(*hint, line),
-    )
+        help=(line,),
+    ).near(item.name, interface.externs)
 
 
 Labels = tuple[tuple[str, float], ...]
@@ -174,8 +173,8 @@ def check_type(type_: ast.TypeRef | None, enums: Mapping[str, Labels], scope: Sc
     if type_ is None:
         return
     if type_.name not in _KINDS and type_.name not in enums and type_.name != "formula":
-        help_ = did_you_mean(type_.name, (*_KINDS, *enums), "types: real, int, bool, or an enum")
-        scope.fail(Diagnostic("E101", f"unknown type `{type_.name}`", type_.span, help=help_))
+        unknown = Diagnostic("E101", f"unknown type `{type_.name}`", type_.span)
+        scope.fail(unknown.near(type_.name, (*_KINDS, *enums), "types: real, int, bool, or an enum"))
     if type_.size is not None and not 1 <= type_.size <= Column.MAX_COMPONENTS:
         message = f"a vector has between 1 and {Column.MAX_COMPONENTS} components"
         scope.fail(Diagnostic("E005", message, type_.span))

@@ -45,7 +45,6 @@ from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
 from stlc.grammar.traverse import children, descendants
 from stlc.grammar.words import BINARY_TEMPORAL, OPERATORS
-from stlc.registry import did_you_mean
 from stlc.signature import Kind
 from stlc.source import Source, Span
 from stlc.units import Unit, nearest
@@ -71,10 +70,9 @@ def _module(expr: ast.Expr, scope: Scope) -> Scope:
             outer = _module(base, scope)
             if name in outer.modules:
                 return outer.modules[name]
-    help_ = did_you_mean(expr.span.text, scope.modules, 'import "file.stl" as m, or import std')
-    return scope.fail(
-        Diagnostic("E101", f"`{expr.span.text}` is not an imported file", expr.span, help=help_)
-    )
+    missing = Diagnostic("E101", f"`{expr.span.text}` is not an imported file", expr.span)
+    advice = 'import "file.stl" as m, or import std'
+    return scope.fail(missing.near(expr.span.text, scope.modules, advice))
 
 
 def choose(expr: ast.IfThenElse, values: Sequence[Value], scope: Scope) -> Value:

@@ -20,7 +20,6 @@ from stlc.compile.ir.support import columns_in
 from stlc.diagnostics import Diagnostic, SpecError, UsageError, usage
 from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
-from stlc.registry import did_you_mean
 from stlc.signature import Column
 from stlc.source import Source
 from stlc.units import Unit
@@ -62,11 +61,12 @@ def read_overrides(
 def _unknown(name: str, own: set[str], interface: Interface | None) -> Diagnostic:
     states = () if interface is None else {each.partition("[")[0] for each in interface.signature.names}
     constants = own | (set() if interface is None else {*interface.constants}) - {*states}
-    help_ = did_you_mean(name, [*constants, *states])
+    help_: tuple[str, ...] = ()
     for kind, names in (("constants", constants), ("states, whose initial values it fixes", states)):
         help_ = (*help_, f"{kind}: {', '.join(sorted(names))}") if names else help_
     message = f"`--set {name}=…`: there is no constant or state `{name}`"
-    return Diagnostic("U101", message, help=help_ or ("the specification has no constant",))
+    found = Diagnostic("U101", message, help=help_ or ("the specification has no constant",))
+    return found.near(name, [*constants, *states])
 
 
 def parameters(

@@ -14,8 +14,8 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import Bounds, callable_names, sampler_names
 from stlc.diagnostics import Diagnostic, Findings, SpecError, StlcError, SystemFileError, tell
 from stlc.grammar import ast
-from stlc.registry import closest
 from stlc.signature import Column, Kind
+from stlc.similar import closest
 from stlc.source import Span
 from stlc.units import Unit, nearest
 

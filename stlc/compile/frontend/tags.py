@@ -18,8 +18,8 @@ from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import nodes
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
-from stlc.registry import closest
 from stlc.signature import Column
+from stlc.similar import closest
 from stlc.source import Span
 from stlc.units import Unit
 

@@ -27,7 +27,7 @@ from stlc.controller.problem.task import Task
 from stlc.diagnostics import usage
 from stlc.dynamics.model.samplers import seeded
 from stlc.dynamics.uncertainty.disturbance import Disturbance
-from stlc.registry import GUARDS, did_you_mean
+from stlc.registry import GUARDS
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement
@@ -169,7 +169,7 @@ class MarginRequest:
         for name in self.named:
             if name not in names:
                 listed = f"safety requirements: {', '.join(names) or 'none'}"
-                raise usage(f"`{name}` is no safety requirement", *did_you_mean(name, names), listed)
+                raise usage(f"`{name}` is no safety requirement", listed).near(name, names)
         found = dict.fromkeys(names, self.every)
         kind = GUARDS.get(guard)
         if self.share is not None and kind.intervenes:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Self, TextIO, cast
 
 from stlc.controller.parallel.elsewhere import RemoteCall, RemoteValue, answer, linked
-from stlc.controller.parallel.workers import NO_FILES, CallFiles, LostCall
+from stlc.controller.parallel.workers import NO_FILES, CallFiles, CallWorkers, LostCall
 from stlc.diagnostics import MissingError
 from stlc.extras import needed
 
@@ -26,7 +26,7 @@ _RECOUNT = 1.0
 """Seconds after which the CPUs of the cluster are counted again."""
 
 
-class RayWorkers:
+class RayWorkers(CallWorkers):
     """Workers of a Ray cluster, as many at a time as it has CPUs for.
 
     Args:

@@ -98,52 +98,50 @@ class CallWorkers(Protocol):
         An exception that the function raised is raised here.
         """
 
+    def results(
+        self,
+        function: Callable[[A], R],
+        arguments: Iterable[A],
+        *,
+        files: Callable[[A], CallFiles] = lambda _: NO_FILES,
+        attempts: int = ATTEMPTS,
+    ) -> Iterator[CallResult[R]]:
+        """Call a function for each argument, and yield the results in the order in which the calls end.
 
-def results(
-    workers: CallWorkers,
-    function: Callable[[A], R],
-    arguments: Iterable[A],
-    *,
-    files: Callable[[A], CallFiles] = lambda _: NO_FILES,
-    attempts: int = ATTEMPTS,
-) -> Iterator[CallResult[R]]:
-    """Call a function for each argument, and yield the results in the order in which the calls end.
+        A call whose worker is lost is made again, `attempts` times in all. Arguments are consumed as workers
+        become free, so memory does not grow with their number.
 
-    A call whose worker is lost is made again, `attempts` times in all. Arguments are consumed as workers
-    become free, so memory does not grow with their number.
-
-    Args:
-        workers: workers, as an entered context.
-        function: function of a module.
-        arguments: one argument per call.
-        files: function that returns the files of the call with a given argument.
-        attempts: number of times that a call is made before it counts as lost.
-    """
-    new = enumerate(arguments)
-    again: deque[int] = deque()
-    going: dict[int, tuple[A, int]] = {}
-    while True:
-        while workers.free > 0:
-            if again:
-                key = again.popleft()
-                argument, tried = going[key]
-            elif (fresh := next(new, None)) is not None:
-                key, argument = fresh
-                tried = 0
-            else:
-                break
-            going[key] = argument, tried + 1
-            workers.submit(key, function, argument, files(argument))
-        if not going:
-            return
-        key, value = workers.result()
-        if isinstance(value, LostCall):
-            if going[key][1] < attempts:
-                again.append(key)
-                continue
-            value = LostCall(value.reason, attempts)
-        del going[key]
-        yield CallResult(key, value)
+        Args:
+            function: function of a module.
+            arguments: one argument per call.
+            files: function that returns the files of the call with a given argument.
+            attempts: number of times that a call is made before it counts as lost.
+        """
+        new = enumerate(arguments)
+        again: deque[int] = deque()
+        going: dict[int, tuple[A, int]] = {}
+        while True:
+            while self.free > 0:
+                if again:
+                    key = again.popleft()
+                    argument, tried = going[key]
+                elif (fresh := next(new, None)) is not None:
+                    key, argument = fresh
+                    tried = 0
+                else:
+                    break
+                going[key] = argument, tried + 1
+                self.submit(key, function, argument, files(argument))
+            if not going:
+                return
+            key, value = self.result()
+            if isinstance(value, LostCall):
+                if going[key][1] < attempts:
+                    again.append(key)
+                    continue
+                value = LostCall(value.reason, attempts)
+            del going[key]
+            yield CallResult(key, value)
 
 
 # ------------------------------------------------------------------------ this machine
@@ -162,7 +160,7 @@ class CallError(Exception):
     """Cause of an exception that a function raised in a worker; its text is the traceback there."""
 
 
-class LocalProcesses:
+class LocalProcesses(CallWorkers):
     """Up to `count` processes of this machine, each with one call at a time; lost ones are replaced.
 
     Args:

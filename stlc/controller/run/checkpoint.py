@@ -81,6 +81,13 @@ def never_saved(run: RunDir) -> bool:
     return not run.has(f"{FOLDER}/{POINTER}") and not any((run.path / FOLDER).glob("step-*.json"))
 
 
+def newest_tensors(run: RunDir) -> Iterator[bytes]:
+    """Bytes of the tensors of the latest checkpoint, unchecked; none if there is no checkpoint."""
+    if run.has(f"{FOLDER}/{POINTER}"):
+        name = run.read_json(f"{FOLDER}/{POINTER}", CheckpointHead)["file"]
+        yield run.read(f"{FOLDER}/{name}", RunDir.MOST_ARRAYS)
+
+
 def load_checkpoint(run: RunDir, *, spec_hash: str, system_hash: str) -> Checkpoint:
     """Load the latest checkpoint of a run.
 

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from stlc.controller.policies.policy import PlanProposer, Policy
     from stlc.dynamics.declaration.decl import SystemDecl
 
-CONFIG = "config.resolved.yaml"
-
 
 @dataclass(frozen=True, slots=True)
 class Run:
@@ -105,7 +103,7 @@ class Run:
         drawn = {item.name for item in spec.items if isinstance(item, ast.Param)} - trained.keys()
         values = {name: text for name, text in changed.items() if name in drawn}
         constants = {name: text for name, text in changed.items() if name not in drawn}
-        config = folder.read_json(CONFIG) if folder.has(CONFIG) else {}
+        config = folder.read_json(RunDir.CONFIG) if folder.has(RunDir.CONFIG) else {}
         whole = isinstance(config, dict) and ("planner" in config or config.get("whole") is True)
         return Task.of(spec, System(decl), overrides=constants, values=values, whole=whole)
 
@@ -215,7 +213,7 @@ def save_library(folder: RunDir, library: Mapping[str, str], below: str = RunDir
 
 def save_config(folder: RunDir, config: ResolvedConfig) -> None:
     """Write the resolved options of a run, as JSON, which is also YAML."""
-    folder.write(CONFIG, json.dumps(asdict(config), indent=1) + "\n")
+    folder.write(RunDir.CONFIG, json.dumps(asdict(config), indent=1) + "\n")
 
 
 def _unknown(folder: RunDir, registry: PackageRegistry[Any], name: str) -> PluginError:
@@ -247,7 +245,7 @@ def load_config(folder: RunDir) -> ResolvedConfig:
         RunError: R101, their file is missing or damaged.
         PluginError: S206, the run needs a method or planner that is not there, or that cannot be loaded.
     """
-    values: dict[str, Any] = folder.read_json(CONFIG, StoredConfig)
+    values: dict[str, Any] = folder.read_json(RunDir.CONFIG, StoredConfig)
     for registry, name in ((METHODS, values["method"]), (PLANNERS, values.get("planner"))):
         if isinstance(name, str) and name not in registry:
             raise _unknown(folder, registry, name)
@@ -256,4 +254,4 @@ def load_config(folder: RunDir) -> ResolvedConfig:
         engine = {field.name: values[field.name] for field in fields(kind) if field.name in values}
         return kind(**{**engine, "hidden": tuple(engine["hidden"])}).checked()
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise RunError(folder.damaged(CONFIG, error)) from error
+        raise RunError(folder.damaged(RunDir.CONFIG, error)) from error

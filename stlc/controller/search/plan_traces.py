@@ -16,7 +16,6 @@ from torch import Tensor
 from stlc.compile.frontend.modules import library_of, spec_sha256
 from stlc.diagnostics import usage
 from stlc.grammar import ast
-from stlc.registry import did_you_mean
 from stlc.trace import Reading, Trace, TraceMeta
 from stlc.trace.recording import conversion
 from stlc.version import __version__
@@ -76,8 +75,8 @@ def _assignment(task: Task, part: str) -> tuple[str, float]:
     """
     name, _, value = (each.strip() for each in part.partition("="))
     if name not in task.system.names:
-        near, known = did_you_mean(name, task.system.names), f"states: {', '.join(task.system.names)}"
-        raise usage(f"`{task.system.decl.name}` has no state `{name}`", "  ".join((*near, known)))
+        missing, names = usage(f"`{task.system.decl.name}` has no state `{name}`"), task.system.names
+        raise missing.near(name, names, listed=f"states: {', '.join(names)}")
     column = task.system.signature[name]
     words = column.words
     word = value.lower() if column.kind == "bool" else value

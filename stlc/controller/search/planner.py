@@ -22,7 +22,7 @@ from stlc.controller.options import value_of
 from stlc.controller.problem.rows import Rows
 from stlc.diagnostics import usage
 from stlc.native import Stop, never
-from stlc.registry import PLANNERS, did_you_mean
+from stlc.registry import PLANNERS
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
@@ -288,8 +288,7 @@ def planner_named(name: str, **options: Any) -> Planner:
     for key, value in options.items():
         if key not in known:
             listed = f"options: {', '.join(known)}" if known else "it has none"
-            advice = "  ".join((*did_you_mean(key, known), listed))
-            raise usage(f"planner `{name}` has no option `{key}`", advice)
+            raise usage(f"planner `{name}` has no option `{key}`").near(key, known, listed=listed)
         values[key] = value_of(f"planner `{name}`", known[key], value)
     planner: Planner = kind(**values)
     return planner

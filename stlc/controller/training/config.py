@@ -14,7 +14,7 @@ from stlc.controller.training.budget import StepSchedule
 from stlc.controller.training.options import TrainOptions
 from stlc.diagnostics import usage
 from stlc.native import cores
-from stlc.registry import METHODS, did_you_mean
+from stlc.registry import METHODS
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
@@ -72,8 +72,7 @@ def _with_own(found: ResolvedConfig, config: TrainConfig) -> ResolvedConfig:
     for name, text in config.options.items():
         if name not in own:
             known = f"options: {', '.join(own)}" if own else "it has no options of its own"
-            advice = did_you_mean(name, own, known)
-            raise usage(f"method `{found.method}` has no option `{name}`", *advice)
+            raise usage(f"method `{found.method}` has no option `{name}`").near(name, own, known)
         changed[name] = value_of(f"method `{found.method}`", own[name], text)
     advice = ("stlc train SPEC --option NAME=VALUE",) if changed else ()
     try:

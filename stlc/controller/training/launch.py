@@ -17,7 +17,7 @@ from stlc.controller.search.planner_policy import PlannerChoice, planner_of
 from stlc.controller.training.config import ENGINE_VERSION, TrainConfig, resolve_config
 from stlc.provenance import git_state, hardware, sha256, versions
 from stlc.registry import METHODS, PLANNERS
-from stlc.rundir import RunDir, now, require_name
+from stlc.rundir import RunDir
 from stlc.version import __version__
 
 
@@ -39,7 +39,7 @@ class Launch:
 
     def __post_init__(self) -> None:
         if self.name is not None:
-            require_name(self.name)
+            RunDir.require_name(self.name)
 
 
 def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -> RunDir:
@@ -62,7 +62,7 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
             "stlc": __version__,
             "command": list(launch.command),
             "status": "running",
-            "started": now(),
+            "started": RunDir.now(),
             "spec": task.compiled.name,
             "spec_path": task.compiled.spec.source.name,
             "system": task.system.decl.name,

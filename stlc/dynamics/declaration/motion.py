@@ -31,8 +31,8 @@ from stlc.dynamics.declaration.schema.record import (
 )
 from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Mapping, Node, Scalar
 from stlc.dynamics.declaration.schema.yaml_nodes import Sequence as ListNode
-from stlc.registry import did_you_mean
 from stlc.signature import Column
+from stlc.similar import did_you_mean
 from stlc.units import Unit
 
 _SAMPLERS = frozenset(sampler_names())

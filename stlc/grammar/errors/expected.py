@@ -14,7 +14,7 @@ from stlc.grammar.errors.failure import ParseFailure
 from stlc.grammar.errors.units import unit_advice
 from stlc.grammar.scan import CLOSES, Lexeme, brackets, closes
 from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, OPERATORS, RESERVED, ROLES, UNARY_TEMPORAL
-from stlc.registry import closest, did_you_mean
+from stlc.similar import closest
 from stlc.source import Label, Span
 from stlc.units import Unit
 
@@ -119,12 +119,14 @@ def unknown_declaration(failure: ParseFailure) -> Diagnostic | None:
         return None
     if not _begins_line(failure, found):
         return None
-    near = did_you_mean(found.text, (*DECLARATIONS, *ROLES, "spec", "system", "time"))
     return Diagnostic(
         "E010",
         f"expected a declaration, found `{found.text}`",
         failure.of(found),
-        help=("  ".join((*near, f"declarations: {' '.join(DECLARATIONS)}")),),
+    ).near(
+        found.text,
+        (*DECLARATIONS, *ROLES, "spec", "system", "time"),
+        listed=f"declarations: {' '.join(DECLARATIONS)}",
     )
 
 

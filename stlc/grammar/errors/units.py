@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from stlc.grammar.words import UNIT_NAMES
-from stlc.registry import closest
+from stlc.similar import closest
 from stlc.units import Unit
 
 _PREFIXES = "pnumkMG"

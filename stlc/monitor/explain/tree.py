@@ -10,7 +10,7 @@ from stlc.compile.ir.traverse import margin_unit
 from stlc.jsontext import Num
 from stlc.monitor.explain.causes import CauseNode
 from stlc.monitor.explain.report import Cause, readings_of
-from stlc.monitor.judgement import Verdict, worst_of
+from stlc.monitor.judgement import Verdict
 
 _WIDTH = 72
 
@@ -87,7 +87,7 @@ class Explanation:
     @property
     def closest(self) -> str:
         """That nothing is violated, and the least robustness: whose it is and where."""
-        worst = worst_of(self.verdict)
+        worst = self.verdict.worst
         return f"nothing is violated ({self.verdict.overall}); {worst.name} comes closest: {worst.brief}"
 
 

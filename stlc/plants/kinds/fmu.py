@@ -17,7 +17,7 @@ from typing import Any, final
 from stlc.dynamics.declaration.schema.record import TEXT, key, number, word
 from stlc.extras import needed
 from stlc.plants.kind import FaultError, Floats, Layout, PlantKind, Port, UnfitError
-from stlc.registry import did_you_mean
+from stlc.similar import did_you_mean
 
 INTERFACES = {"co-simulation": "coSimulation", "model exchange": "modelExchange"}
 _NEAR = 1e-9

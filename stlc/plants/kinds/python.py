@@ -29,7 +29,7 @@ from stlc.dynamics.declaration.schema.record import TEXT, integer, key, number, 
 from stlc.extras import needed
 from stlc.foreign import module_at
 from stlc.plants.kind import FaultError, Floats, Layout, PlantKind, UnfitError, vector
-from stlc.registry import did_you_mean
+from stlc.similar import did_you_mean
 
 TARGET = re.compile(r"(?P<module>[\w./-]+\.py|\w+(?:\.\w+)*):(?P<attribute>[^\W\d]\w*)")
 FORMS = ("class", "step", "flow")

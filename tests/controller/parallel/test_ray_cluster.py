@@ -19,7 +19,7 @@ from stlc.controller.parallel.elsewhere import SeenFile
 from stlc.controller.parallel.jobs import Job
 from stlc.controller.parallel.ray_cluster import RayWorkers
 from stlc.controller.parallel.ray_jobs import RayExecutor
-from stlc.controller.parallel.workers import CallFiles, results
+from stlc.controller.parallel.workers import CallFiles
 from stlc.diagnostics import MissingError
 from stlc.extras import installation
 from stlc.rundir import RunDir
@@ -125,8 +125,7 @@ def test_files_of_every_call_are_sent_once(ray: Ray, connected: bool) -> None:
         assert [path.read_text() for path in ray.folder.iterdir()] == (
             [] if connected else ["text of spec.stl"]
         )
-        found = results(
-            workers,
+        found = workers.results(
             texts,
             [("spec.stl", "a.csv"), ("spec.stl", "b.csv"), ("spec.stl",)],
             files=lambda names: CallFiles(tuple(map(Path, names))),

@@ -10,14 +10,7 @@ from pathlib import Path
 import pytest
 
 from stlc.controller.parallel import workers_of
-from stlc.controller.parallel.workers import (
-    ATTEMPTS,
-    CallError,
-    LocalProcesses,
-    LostCall,
-    end_in_words,
-    results,
-)
+from stlc.controller.parallel.workers import ATTEMPTS, CallError, LocalProcesses, LostCall, end_in_words
 
 
 def square(number: int) -> int:
@@ -54,13 +47,13 @@ def own_process(_: int) -> int:
 def test_every_argument_has_a_result() -> None:
     with LocalProcesses(2) as workers:
         for count in (0, 1, 9):  # the same processes again
-            found = {each.index: each.value for each in results(workers, square, range(count))}
+            found = {each.index: each.value for each in workers.results(square, range(count))}
             assert found == {number: number * number for number in range(count)}
 
 
 def test_as_many_processes_as_are_asked_for() -> None:
     with LocalProcesses(3) as workers:
-        processes = {each.value for each in results(workers, own_process, range(12))}
+        processes = {each.value for each in workers.results(own_process, range(12))}
         assert len(processes) == 3
         assert os.getpid() not in processes
     for process in processes:
@@ -71,7 +64,7 @@ def test_as_many_processes_as_are_asked_for() -> None:
 def test_a_lost_worker_costs_its_own_call_only(tmp_path: Path) -> None:
     jobs = [(str(tmp_path), number, {3: 2, 5: 9}.get(number, 0)) for number in range(12)]
     with LocalProcesses(2) as workers:
-        found = {each.index: each.value for each in results(workers, fragile, jobs)}
+        found = {each.index: each.value for each in workers.results(fragile, jobs)}
     lost = found.pop(5)
     assert found == {number: number for number in range(12) if number != 5}
     assert lost == LostCall(end_in_words(-signal.SIGKILL), ATTEMPTS)
@@ -81,13 +74,13 @@ def test_a_lost_worker_costs_its_own_call_only(tmp_path: Path) -> None:
 
 def test_a_call_may_be_made_once_only(tmp_path: Path) -> None:
     with LocalProcesses(1) as workers:
-        (ended,) = results(workers, fragile, [(str(tmp_path), 0, 1)], attempts=1)
+        (ended,) = workers.results(fragile, [(str(tmp_path), 0, 1)], attempts=1)
     assert ended.value == LostCall(end_in_words(-9), 1)
 
 
 def test_how_a_process_ended_is_said() -> None:
     with LocalProcesses(1) as workers:
-        (ended,) = results(workers, leave, [0])
+        (ended,) = workers.results(leave, [0])
     assert ended.value == LostCall("its process ended with exit code 7", ATTEMPTS)
     assert "SIGKILL, as the system does for lack of memory" in end_in_words(-9)
     assert end_in_words(-signal.SIGSEGV) == "its process was ended by SIGSEGV"
@@ -99,7 +92,7 @@ def test_what_a_function_raises_is_raised_here() -> None:
         pytest.raises(KeyError, match="two is refused") as caught,
         LocalProcesses(2) as workers,
     ):
-        list(results(workers, refuse, range(5)))
+        list(workers.results(refuse, range(5)))
     assert isinstance(caught.value.__cause__, CallError)
     assert "in refuse" in str(caught.value.__cause__)
 
@@ -113,12 +106,12 @@ def test_arguments_are_taken_as_workers_become_free() -> None:
             yield number
 
     with LocalProcesses(2) as workers:
-        ended = results(workers, square, arguments())
+        ended = workers.results(square, arguments())
         next(ended)
         assert len(taken) <= 3
 
 
 def test_processes_with_an_empty_interpreter() -> None:
     with workers_of(1, fresh=True) as workers:
-        (ended,) = results(workers, square, [4])
+        (ended,) = workers.results(square, [4])
     assert ended.value == 16

@@ -187,7 +187,7 @@ def _judged(works: Sequence[Work], jobs: int, cluster: str | None) -> Iterator[t
         yield from enumerate(map(safe_outcomes, works))
         return
     from stlc.controller.parallel import workers_of
-    from stlc.controller.parallel.workers import CallFiles, LostCall, results
+    from stlc.controller.parallel.workers import CallFiles, LostCall
 
     sent: Sequence[Work] = works
     texts: Sequence[Path] = ()
@@ -203,7 +203,7 @@ def _judged(works: Sequence[Work], jobs: int, cluster: str | None) -> Iterator[t
         return CallFiles((*texts, Path(work.name)), () if work.out is None else (work.out,))
 
     with workers_of(processes, cluster, files=texts) as workers:
-        for ended in results(workers, safe_outcomes, sent, files=read):
+        for ended in workers.results(safe_outcomes, sent, files=read):
             value = ended.value
             yield ended.index, [_lost(works[ended.index], value)] if isinstance(value, LostCall) else value
 

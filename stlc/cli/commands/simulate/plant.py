@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from stlc.cli.commands.check.text import WORDS, in_unit, robustness_text
 from stlc.cli.framework.output import emit, say, table
 from stlc.escape import operand, shell, visible
-from stlc.monitor.judgement import worst_of
 from stlc.units import time_text
 
 if TYPE_CHECKING:
@@ -67,7 +66,7 @@ def _rows(found: PlantSimulation) -> Iterator[tuple[str, ...]]:
         if run.verdict is None:
             yield str(run.seed), "FINDING", "", run.finding.reason if run.finding else "", point
             continue
-        word, worst = run.verdict.scoped, worst_of(run.verdict)
+        word, worst = run.verdict.scoped, run.verdict.worst
         low, high = (float(end.min()) for end in worst.margins)
         value = robustness_text(worst.statuses[0], low, high, float(worst.least[0]), worst.unit)
         yield str(run.seed), WORDS[word], worst.name, value, point

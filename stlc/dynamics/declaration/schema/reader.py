@@ -9,7 +9,7 @@ from typing import TypeVar
 from stlc.diagnostics import Diagnostic, Findings, SystemFileError, tell
 from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence
 from stlc.escape import unseen
-from stlc.registry import did_you_mean
+from stlc.similar import did_you_mean
 from stlc.source import Label, Source, Span
 
 V = TypeVar("V")
@@ -101,12 +101,8 @@ class Reader:
         `where` names the mapping in the message.
         """
         listed = f"keys of {where}: {', '.join(known)}"
-        self.report(
-            code,
-            f"unknown key `{key.text}` in {where}",
-            key.span,
-            "  ".join((*did_you_mean(key.text, known), listed)),
-        )
+        found = Diagnostic(code, f"unknown key `{key.text}` in {where}", key.span)
+        self.add(found.near(key.text, known, listed=listed))
 
     def items(self, node: Node | None, where: str) -> tuple[Node, ...]:
         """Read the items of a list; empty for a missing or null node. `where` names the list in messages."""
