@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from stlc.diagnostics import StlcError, TraceError, UsageError
-from stlc.signature import TRUTH, Column, Signature
+from stlc.signature import Column, Signature
 from stlc.trace import Reading, Trace, TraceMeta, as_fraction
 from stlc.trace.formats import csv as trace_csv
 from stlc.trace.formats.npz import read as read_npz
@@ -507,7 +507,7 @@ def test_another_clock_than_the_usual_one(tmp_path: Path) -> None:
     assert set(trace.data) == {"x", "time"}
 
 
-WORDS = {"sign": {"stop": 0.0, "light": 1.0}, "on": TRUTH, "x": {}}
+WORDS = {"sign": {"stop": 0.0, "light": 1.0}, "on": Column.TRUTH, "x": {}}
 
 
 @pytest.mark.parametrize(
