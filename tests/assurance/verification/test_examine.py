@@ -15,7 +15,7 @@ from stlc.assurance.verification.examine import BatchResult, BoxBatch, Examiner,
 from stlc.assurance.verification.judged import BoxVerdicts
 from stlc.assurance.verification.plans import ProposedPlans
 from stlc.assurance.verification.verify import HOPELESS, Verification, Verifier, _Front
-from stlc.controller.parallel.workers import NO_FILES, CallFiles, LostCall
+from stlc.controller.parallel.workers import NO_FILES, CallFiles, CallWorkers, LostCall
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Source:
         return ProposedPlans(policy().task, policy())
 
 
-class Shuffled:
+class Shuffled(CallWorkers):
     """Workers in this process that answer the latest call first, and lose some.
 
     Attributes:
