@@ -19,7 +19,6 @@ from numpy.random import Generator, default_rng
 
 from benchmarks.circles import PATTERNS, STEPS, TRIES, Draw, DrawnTask
 from stlc.compile.backends.array.arith import ArrayProgram
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.kinematics import chain, position, read_urdf
 from stlc.files import File
@@ -140,5 +139,5 @@ def _position(text: str, link: str) -> list[float]:
     args = tuple(ir.Signal(name) for name in body.formals)
     program = ArrayProgram({str(i): ir.Extern("f", args, i, body) for i in range(3)})
     angles = {name: np.array([angle]) for name, angle in zip(body.formals, START, strict=False)}
-    found = program(angles, NUMPY)
+    found = program(angles)
     return [float(np.ravel(found[str(i)])[0]) for i in range(3)]

@@ -99,7 +99,7 @@ class Case:
 
 def _atom(name: str, above: float = 0.0) -> ir.Predicate:
     column = ir.Signal(name)
-    return ir.Predicate(ir.Op("sub", (column, ir.Const(above))) if above else column)
+    return ir.Predicate(column - above if above else column)
 
 
 def _over(op: str, hi: int | None, body: ir.Formula) -> ir.Temporal:

@@ -20,7 +20,7 @@ import numpy as np
 
 from stlc.diagnostics import StlcError, usage
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.provenance import sha256
 
 JUDGE = "judge.py"
@@ -78,7 +78,7 @@ def tasks_in(folder: Path) -> tuple[ControlTask, ...]:
 
 def _has_system(path: Path) -> bool:
     try:
-        return parse(File(path).read()).system is not None
+        return Spec.parse(File(path).read()).system is not None
     except StlcError:
         return True  # the commands say what is wrong with it
 

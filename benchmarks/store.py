@@ -9,12 +9,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from stlc.compile.frontend.modules import library_of
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import usage
 from stlc.dynamics.system import System
 from stlc.files import File, alone_in
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.jsontext import dumps, plain
 from stlc.provenance import git_state, hardware, sha256, versions
 from stlc.rundir import RunDir
@@ -131,7 +130,7 @@ def load(benchmark: str, overrides: tuple[tuple[str, str], ...] = ()) -> Task:
 
 @cache
 def _load(_where: Path, path: Path, overrides: tuple[tuple[str, str], ...]) -> Task:
-    spec = parse(File(path).read())
+    spec = Spec.parse(File(path).read())
     if spec.system is None:
         raise usage(f"`{path}` names no system")
     changed = dict(overrides)
@@ -142,7 +141,7 @@ def _load(_where: Path, path: Path, overrides: tuple[tuple[str, str], ...]) -> T
 def inputs_of(task: Task) -> dict[str, str]:
     """Return hashes of the specification (with imports) and of the system's parts that affect training."""
     spec, decl = task.compiled.spec, task.system.decl
-    texts = [spec.source.text, *(f"{key}\n{text}" for key, text in sorted(library_of(spec).items()))]
+    texts = [spec.source.text, *(f"{key}\n{text}" for key, text in sorted(spec.imported_texts().items()))]
     named = (f"{name} {sha256(path.read_bytes())}" for name, path in sorted(decl.files.items()))
     return {
         "spec_sha256": sha256("\0".join(texts)),

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from stlc.diagnostics import SpecError, StlcError
     from stlc.dynamics.system import System
     from stlc.export.targets import export
-    from stlc.grammar import ast
+    from stlc.grammar.spec import Spec
     from stlc.monitor.check import check
     from stlc.monitor.judgement import RequirementVerdict, Verdict
     from stlc.monitor.linted import lint
@@ -131,7 +131,7 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
-def load(path: Path | str) -> ast.Spec:
+def load(path: Path | str) -> Spec:
     """Read and parse a specification file.
 
     Its path is stored in the result, because a system that the specification names is looked for beside it.
@@ -140,18 +140,17 @@ def load(path: Path | str) -> ast.Spec:
         UsageError: U102, there is no such file.
         SpecError: the text is not a specification; the error carries all diagnostics.
     """
-    from stlc.files import File
-    from stlc.grammar.parser import parse as parse_source
+    from stlc.grammar.spec import Spec
 
-    return parse_source(File(File(path).spec()).read())
+    return Spec.load(path)
 
 
-def parse(text: str, name: str = "<text>") -> ast.Spec:
+def parse(text: str, name: str = "<text>") -> Spec:
     """Parse the text of a specification; `name` names the text in messages. Raises SpecError."""
-    from stlc.grammar.parser import parse as parse_source
+    from stlc.grammar.spec import Spec
     from stlc.source import Source
 
-    return parse_source(Source(name, text))
+    return Spec.parse(Source(name, text))
 
 
 class _CallablePackage(ModuleType):

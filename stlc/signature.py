@@ -61,6 +61,33 @@ class Signature:
         """Column names in order."""
         return tuple(column.name for column in self.columns)
 
+    @property
+    def nominal(self) -> dict[str, tuple[float, float]]:
+        """Declared range of each column that has one, enforced or not, in the unit of the column."""
+        return {
+            column.name: (column.low, column.high)
+            for column in self.columns
+            if column.low is not None and column.high is not None
+        }
+
+    @property
+    def enforced(self) -> dict[str, tuple[float, float]]:
+        """Ranges that columns never leave, each in the unit of its column.
+
+        Bools and enums have such a range, and so does a column whose range is marked as enforced
+        (`Column.fact`).
+        """
+        facts: dict[str, tuple[float, float]] = {}
+        for column in self.columns:
+            if column.kind == "bool":
+                facts[column.name] = (0.0, 1.0)
+            elif column.labels:
+                values = [value for _, value in column.labels]
+                facts[column.name] = (min(values), max(values))
+            elif column.fact and column.low is not None and column.high is not None:
+                facts[column.name] = (column.low, column.high)
+        return facts
+
     def __len__(self) -> int:
         return len(self.columns)
 

@@ -22,7 +22,7 @@ from stlc.cli.framework.app import main
 from stlc.diagnostics import CODES
 from stlc.dynamics.declaration.schema.record import reference
 from stlc.dynamics.declaration.sections import SystemKeys
-from stlc.grammar.manual import read_page
+from stlc.grammar.manual import Page
 from stlc.plants.declaration import PlantKeys
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -164,7 +164,7 @@ def test_every_code_is_listed(regenerate):
 
 def code_section(code: str) -> list[str]:
     """The page of a code (`stlc explain CODE`); its examples are held against the program elsewhere."""
-    page = read_page(code)
+    page = Page.read(code)
     assert page is not None, code
     lines = [f'### <a id="{code.lower()}"></a>{page.title}', ""]
     for line in page.text.splitlines():

@@ -17,6 +17,7 @@ from stlc import files
 from stlc.cli.framework.render import render_text
 from stlc.diagnostics import MissingError, RunError, SpecError, StlcError, UsageError
 from stlc.files import File, named_in, place, read_regular, within
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -366,11 +367,9 @@ def test_what_could_wait_or_never_end_is_not_read(tmp_path: Path) -> None:
         with pytest.raises(UsageError, match=f"cannot read .*it is {noun}"):
             File(tmp_path / name).read()
     (tmp_path / "main.stl").write_text('import "pipe.stl" as p\nsignal x\nrequire r: x > 0\n')
-    from stlc.compile.frontend.modules import library_of
-    from stlc.grammar.parser import parse
 
     with pytest.raises(SpecError, match="it is a pipe"):
-        library_of(parse(File(tmp_path / "main.stl").read()))
+        Spec.parse(File(tmp_path / "main.stl").read()).imported_texts()
 
 
 def test_a_pipe_of_the_shell_is_read() -> None:

@@ -25,8 +25,8 @@ from stlc.compile.backends.c.emit import Motion, emit
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import TraceError
-from stlc.grammar.parser import parse
 from stlc.grammar.printer import show
+from stlc.grammar.spec import Spec
 from stlc.signature import Column, Signature
 from stlc.source import Source
 from stlc.trace import Trace, TraceMeta, read_recording
@@ -120,10 +120,12 @@ def test_a_tree_has_as_many_nodes_and_every_name(judged: list[str], said: Said) 
 @pytest.mark.apart
 @pytest.mark.usefixtures("judged")
 def test_printed_and_formatted_texts_mean_the_same(said: Said) -> None:
-    before = parse(Source("h", Path("h.stl").read_bytes().decode()))
-    assert [item.name for item in parse(Source("h", show(before))).items] == [i.name for i in before.items]
+    before = Spec.parse(Source("h", Path("h.stl").read_bytes().decode()))
+    assert [item.name for item in Spec.parse(Source("h", show(before))).items] == [
+        i.name for i in before.items
+    ]
     assert said("fmt", "h.stl")[0] == 0
-    after = parse(Source("h", Path("h.stl").read_bytes().decode()))
+    after = Spec.parse(Source("h", Path("h.stl").read_bytes().decode()))
     assert [(i.name, i.doc) for i in after.items] == [(i.name, i.doc) for i in before.items]
     assert said("fmt", "h.stl", "--check")[0] == 0
 
@@ -340,7 +342,7 @@ def compiled_c(names: list[str]) -> tuple[str, str]:
         f"freeze `h{name}` = `{name}` in eventually[0, 2 s] `d{name}`(`{name}`) > `h{name}`)"
         for name in names
     ]
-    spec = parse(Source("h.stl", "\n".join(lines) + "\n"))
+    spec = Spec.parse(Source("h.stl", "\n".join(lines) + "\n"))
     compiled = compile_spec(spec, grid=Grid(Fraction(1, 10), 30))
     formulas = [rule.formula for rule in compiled.requirements]
     motion = Motion(tuple(names), (), (), {}, 30, 0.1)

@@ -23,7 +23,7 @@ from stlc.dynamics.load import load_system_decl
 from stlc.dynamics.system import System
 from stlc.export.c_header import header, main_of
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.jsontext import dumps
 from stlc.rundir import RunDir
 
@@ -81,7 +81,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def task_of(spec: str, system: str) -> Task:
     Path("h.stl").write_text(spec, encoding="utf-8", newline="")
     Path("h.yaml").write_text(system, encoding="utf-8")
-    return Task.of(parse(File("h.stl").read()), System.load("h.yaml"))
+    return Task.of(Spec.parse(File("h.stl").read()), System.load("h.yaml"))
 
 
 # --------------------------------------------------------------------------- systems
@@ -121,7 +121,7 @@ def test_a_specification_from_a_system_means_its_words(folder: Path) -> None:
     for name in ("a b", "always", "x # y", "</b>", "T", "dt"):
         (folder / "s.yaml").write_text(system_of(name), encoding="utf-8")
         assert main(["init", "--spec", "made", "--from", "s.yaml", "--force"]) == 0
-        enum = next(item for item in parse(File("made.stl").read()).items if type(item).__name__ == "Enum")
+        (enum,) = Spec.parse(File("made.stl").read()).enums
         assert [member for member, _ in enum.members] == [name, "other"]
 
 

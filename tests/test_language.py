@@ -17,7 +17,7 @@ from stlc.dynamics.load import load_system_decl
 from stlc.files import File
 from stlc.grammar import ast
 from stlc.grammar.format.format import format_text
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.grammar.words import RESERVED
 from stlc.lint.lint import Selection, lint
 from stlc.monitor.verdict import Monitor
@@ -48,7 +48,7 @@ def whole(example: Example) -> tuple[Source, int]:
 def findings(source: Source, example: Example) -> list[Diagnostic]:
     """Findings of the compiler."""
     try:
-        spec = parse(source)
+        spec = Spec.parse(source)
         grid, interface = Grid(trace().dt, trace().horizon), None
         if spec.system is not None:
             decl = load_system_decl(File(spec.system).system(Path(source.name)))
@@ -117,7 +117,7 @@ def judge(example: Example, claim: Claim) -> tuple[Monitor, str]:
     lines = example.text.splitlines()
     kept = "\n".join("" if number in wrong else line for number, line in enumerate(lines, start=1))
     head = source.text[: len(source.text) - len(example.text)]
-    spec = parse(Source(source.name, head + kept))
+    spec = Spec.parse(Source(source.name, head + kept))
     (name,) = [
         item.name
         for item in spec.items
@@ -128,14 +128,14 @@ def judge(example: Example, claim: Claim) -> tuple[Monitor, str]:
     return Monitor(spec, dt=dt, horizon=dt * trace().horizon), name
 
 
-def added(spec: ast.Spec, name: str) -> list[str]:
+def added(spec: Spec, name: str) -> list[str]:
     """The states that the compiler adds for a requirement alone."""
     items = tuple(item for item in spec.items if not isinstance(item, ast.Require) or item.name == name)
     compiled = compile_spec(replace(spec, items=items), grid=Grid(trace().dt, trace().horizon))
     return [timer.name for timer in compiled.timers]
 
 
-def last_line(item: ast.Item) -> int:
+def last_line(item: ast.Declaration) -> int:
     return item.span.source.position(item.span.end)[0]
 
 

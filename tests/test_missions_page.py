@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from stlc.grammar import ast
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -22,7 +22,7 @@ def test_the_specification_on_the_page_is_the_one_that_is_there():
 
 
 def formulas(text: str) -> dict[str, ast.Expr]:
-    spec = parse(Source("patrol.stl", text))
+    spec = Spec.parse(Source("patrol.stl", text))
     return {item.name: item.formula for item in spec.items if isinstance(item, ast.Require)}
 
 

@@ -14,7 +14,7 @@ from helpers import reference
 from stlc.compile.backends.array.graph import RobustnessGraph
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import Compiled, compile_spec
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 GRID = Grid(Fraction(1, 10), 25)
@@ -24,7 +24,7 @@ TRAJECTORIES = 60
 @pytest.fixture(scope="module")
 def traffic() -> Compiled:
     path = Path(__file__).parents[1] / "specs" / "traffic.stl"
-    return compile_spec(parse(Source("specs/traffic.stl", path.read_text())), grid=GRID)
+    return compile_spec(Spec.parse(Source("specs/traffic.stl", path.read_text())), grid=GRID)
 
 
 @pytest.fixture(scope="module")

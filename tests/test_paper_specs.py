@@ -10,7 +10,7 @@ import pytest
 from stlc.compile.pipeline import compile_spec
 from stlc.dynamics.load import load_system_decl
 from stlc.grammar.format.format import format_text
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 
@@ -29,7 +29,7 @@ SYSTEMS = {
 def test_a_benchmark_is_whole(name: str) -> None:
     path = ROOT / "specs" / f"{name}.stl"
     source = Source(f"specs/{name}.stl", path.read_text())
-    spec = parse(source)
+    spec = Spec.parse(source)
     assert spec.name == name
     assert spec.system == f"../examples/{SYSTEMS[name]}.yaml"
     decl = load_system_decl(ROOT / "examples" / f"{SYSTEMS[name]}.yaml")

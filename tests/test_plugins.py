@@ -20,7 +20,7 @@ from stlc.controller.training.launch import Launch, open_folder
 from stlc.diagnostics import PluginError, SystemFileError, UsageError
 from stlc.dynamics.load import load_system_decl
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.plants.declaration import load_plant_decl, plant_schema
 from stlc.plants.kind import KINDS
 from stlc.plugins import plugins, variable
@@ -59,7 +59,7 @@ output: {total: }
 
 @pytest.fixture
 def car_task() -> Task:
-    return Task.of(parse(File(SPEC).read()), System.load(CAR))
+    return Task.of(Spec.parse(File(SPEC).read()), System.load(CAR))
 
 
 @pytest.fixture

@@ -13,19 +13,18 @@ from typing import Any
 from stlc.compile.ir.functions import REGIONS, callable_names
 from stlc.editor.vocabulary import FUNCTIONS
 from stlc.grammar.words import (
-    BINARY_TEMPORAL,
     BUILT_IN,
     DECLARATIONS,
+    OPERATORS,
     PATTERNS,
     PRAGMAS,
     RESERVED,
     ROLES,
-    UNARY_TEMPORAL,
 )
 
 _TYPES = ("real", "int", "bool", "formula")
 _CONSTANTS = ("true", "false", "inf")
-_TEMPORAL = (*UNARY_TEMPORAL, *BINARY_TEMPORAL)
+_TEMPORAL = tuple(OPERATORS)
 _WORDS = (*sorted(RESERVED - {*DECLARATIONS, *_TEMPORAL, *_CONSTANTS}), "from", "as")
 """Reserved words without a pattern of their own."""
 _NAME = r"`[^`\n]+`|[^\W\d]\w*"

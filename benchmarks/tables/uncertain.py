@@ -24,9 +24,8 @@ from stlc.cli.framework.program import command
 from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.interval import Intervals
 from stlc.compile.backends.array.interval_ops import INTERVALS
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.monitor.uncertain import Uncertainty
 from stlc.monitor.verdict import Monitor
 
@@ -123,14 +122,14 @@ def _formula(case: Case, samples: int, traces: int) -> list[Callable[[], object]
     env = {name: rng.normal(size=(samples, traces)) for name in "xy"}
     box = {name: Intervals(x - _ERROR, x + _ERROR) for name, x in env.items()}
     return [
-        lambda: robustness_signal(formula, env, ops=NUMPY, end="truncate"),
+        lambda: robustness_signal(formula, env, end="truncate"),
         lambda: robustness_signal(formula, box, ops=INTERVALS, end="truncate"),
     ]
 
 
 def _specification(name: str, samples: int, traces: int) -> list[Callable[[], object]]:
     rng = np.random.default_rng(0)
-    spec = parse(File(spec_path(name)).read())
+    spec = Spec.parse(File(spec_path(name)).read())
     monitor = Monitor(spec, system=spec.system)
     columns = monitor.compiled.signature.columns
     signals = {}

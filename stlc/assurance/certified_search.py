@@ -20,7 +20,6 @@ from torch import Tensor
 
 from stlc.assurance.verification.tubes import Tube, TubeModel
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.ir.support import columns_in
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import (
     POLICY,
@@ -102,7 +101,7 @@ class Certifier:
             if loss > max(least.get(rule.name, 0.0), TOLERANCE):
                 margin[rule.name] = loss
             if rule.name not in least:
-                ramp[rule.name] = _growth(tube, columns_in(rule.formula))
+                ramp[rule.name] = _growth(tube, rule.formula.columns)
         return with_margins(self.task, margin, ramp)
 
 

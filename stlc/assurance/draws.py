@@ -15,11 +15,9 @@ import numpy as np
 from stlc.assurance.campaign import CertificateVerification, StoredCertificate, compared, seed_ranges
 from stlc.assurance.certificate import Judged, Sample, together
 from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.frontend.modules import library_of, spec_sha256
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.jsontext import Count
 from stlc.monitor.judgement import chosen
 from stlc.plants.declaration import PlantDecl, load_plant_decl
@@ -29,7 +27,6 @@ if TYPE_CHECKING:
     from stlc.assurance.model_simulator import ModelSimulator
     from stlc.assurance.plant_judge import JudgedRun, PlantJudge
     from stlc.compile.pipeline import CompiledRequirement
-    from stlc.grammar import ast
     from stlc.plants.plant import PlantFinding
 
 MOST_FINDINGS = 20
@@ -160,7 +157,7 @@ class ModelDraws:
 
     @staticmethod
     def _evaluated(rules: Sequence[CompiledRequirement], columns: Mapping[str, Any]) -> Sequence[Any]:
-        return evaluate([rule.formula for rule in rules], columns, ops=NUMPY)
+        return evaluate([rule.formula for rule in rules], columns)
 
     def record(self, seeds: Sequence[int]) -> CertifiedDraws:
         """Record of the system in the certificate, its files, and the conditions."""
@@ -237,7 +234,7 @@ def _judged(run: JudgedRun, rule: CompiledRequirement) -> Judged:
 # ---------------------------------------------------------------------- verification
 
 
-def plant_inputs(spec: ast.Spec, decl: PlantDecl) -> dict[str, str]:
+def plant_inputs(spec: Spec, decl: PlantDecl) -> dict[str, str]:
     """Hashes of what the simulations of a plant depend on.
 
     `spec`: the specification with its imports. `plant`: the plant file. `file …`: each file that the plant
@@ -245,20 +242,16 @@ def plant_inputs(spec: ast.Spec, decl: PlantDecl) -> dict[str, str]:
     versions.
     """
     files = {f"file {name}": _file_hash(path) for name, path in sorted(decl.files.items())}
-    return {"spec": _spec_hash(spec), "plant": sha256(decl.source.text), **files}
+    return {"spec": spec.sha256, "plant": sha256(decl.source.text), **files}
 
 
-def system_inputs(spec: ast.Spec, system: Path, overrides: Mapping[str, str]) -> dict[str, str]:
+def system_inputs(spec: Spec, system: Path, overrides: Mapping[str, str]) -> dict[str, str]:
     """Hashes of what the simulations of a system depend on: as `plant_inputs`."""
     from stlc.dynamics.load import load_system_decl
 
     files = load_system_decl(system, overrides).files
     hashes = {f"file {name}": _file_hash(path) for name, path in sorted(files.items())}
-    return {"spec": _spec_hash(spec), "system": sha256(File(system).read().text), **hashes}
-
-
-def _spec_hash(spec: ast.Spec) -> str:
-    return spec_sha256(spec.source.text, library_of(spec))
+    return {"spec": spec.sha256, "system": sha256(File(system).read().text), **hashes}
 
 
 def _file_hash(path: Path) -> str:
@@ -279,7 +272,7 @@ def verify_draws(stored: StoredCertificate, spec: str | None, system: str | None
         ValueError: its numbers are no counts of drives.
         UsageError, SpecError, SystemFileError: a file is missing or invalid.
     """
-    text = parse(File(File(spec or stored.spec_file).spec()).read())
+    text = Spec.load(spec or stored.spec_file)
     named = Path(system or stored.system_file)
     if stored.kind == "plant":
         decl = load_plant_decl(named)

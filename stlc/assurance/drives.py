@@ -19,7 +19,6 @@ from stlc.assurance.campaign import (
 )
 from stlc.assurance.certificate import Judged, Noun, Sample, together
 from stlc.assurance.model_simulator import in_scope
-from stlc.compile.frontend.modules import spec_sha256
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import Setting
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Watch, simulate
@@ -173,7 +172,7 @@ def inputs_of(folder: RunDir, decl: SystemDecl, rules: Rules | None, guard: str)
         UsageError: U101, there is no guard called `guard`.
     """
     files = sorted(decl.files.items())
-    judge = "" if rules is None else spec_sha256(rules.spec.source.text, rules.spec.library or {})
+    judge = "" if rules is None else rules.spec.sha256
     changes = [] if rules is None else sorted(rules.overrides.items())
     return CertifiedInputs(
         folder.hashes["spec_hash"],

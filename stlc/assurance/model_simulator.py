@@ -14,11 +14,6 @@ from torch import Tensor
 from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
 from stlc.assurance.simulation import PARTS, Simulations
 from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.discretize import counts_samples
-from stlc.compile.ir.support import columns_in
-from stlc.compile.ir.traverse import nodes
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.kernel import Adjoint, ObjectiveSlopes
 from stlc.controller.problem.native import NativeGradient, NativeJudge
@@ -115,16 +110,15 @@ class ModelSimulator:
             return 1.0
         names = {each.name for each in inputs}
         read_by = (self.task.rules[requirement], *self.task.compiled.assumptions)
-        last = max(rule.reach + bool(columns_in(rule.formula) & names) for rule in read_by)
+        last = max(rule.reach + bool(rule.formula.columns & names) for rule in read_by)
         # an input is also read at the last sample
         return min(last * self.task.system.dt / _duration(self.task), 1.0)
 
     def graded(self, requirement: int) -> bool:
         """True if a predicate reads a real signal, so that its margin varies continuously."""
         whole = {each.name for each in self.task.system.decl.signature.columns if each.kind != "real"}
-        found = nodes(self.task.rules[requirement].formula)
-        predicates = [each for each in found if isinstance(each, ir.Predicate) and not each.guard]
-        return not predicates or any(columns_in(each) - whole for each in predicates)
+        predicates = [each for each in self.task.rules[requirement].formula.predicates() if not each.guard]
+        return not predicates or any(each.columns - whole for each in predicates)
 
     def simulate(self, points: NDArray[np.float64], requirement: int) -> Simulations:
         """Simulate `points`, (count, dim), and judge them by a requirement."""
@@ -163,7 +157,7 @@ class ModelSimulator:
             return None
         states = self.points.states(torch.tensor(points))
         admissible = self.points.admissible(states).numpy()
-        task = self.finer(counts_samples(self.task.rules[requirement].typed.formula))
+        task = self.finer(self.task.rules[requirement].typed.formula.counts_samples)
         return self._judged(task, self.columns_of(task, states), requirement, admissible)
 
     def gradient(self, point: Point, requirement: int) -> Point | None:
@@ -242,7 +236,7 @@ def in_scope(task: Task, columns: Columns) -> NDArray[np.bool_]:
     """True for the simulations that violate no assumption of the specification, (count,)."""
     scope = np.ones(next(iter(columns.values())).shape[1], dtype=np.bool_)
     for rule in task.compiled.assumptions:
-        _, high = rule_bounds(rule, Record.of(columns, NUMPY), range(1), task.horizon, "open")
+        _, high = rule_bounds(rule, Record.of(columns), range(1), task.horizon, "open")
         scope &= ~TOLERANCE.violated(high[0])
     return scope
 
@@ -255,7 +249,7 @@ def _kernel(task: Task) -> NativeJudge | None:
 def _margins(task: Task, columns: Columns, requirements: Sequence[int]) -> NDArray[np.float64]:
     """Exact robustness of some requirements of a task, (count, requirements)."""
     formulas = [task.rules[index].formula for index in requirements]
-    each = evaluate(formulas, columns, ops=NUMPY) if formulas else []
+    each = evaluate(formulas, columns) if formulas else []
     count = next(iter(columns.values())).shape[1]
     found = np.zeros((count, len(formulas)))
     for index, margin in enumerate(each):

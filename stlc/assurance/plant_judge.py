@@ -10,9 +10,7 @@ from typing import ClassVar, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.frontend.modules import library_of, spec_sha256
-from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.jsontext import Num
 from stlc.monitor.judgement import Verdict
 from stlc.monitor.signals import arrange, needs_of
@@ -170,7 +168,7 @@ class PlantJudge:
             TraceError: E601, E605, the plant lacks a signal that the requirements read, or has another unit.
         """
         found = load_plant(plant)
-        monitor = Monitor(parse(File(File(spec).spec()).read()), dt=found.decl.dt, overrides=overrides)
+        monitor = Monitor(Spec.load(spec), dt=found.decl.dt, overrides=overrides)
         compiled, signature = monitor.compiled, found.signature
         sample = Trace(
             signature,
@@ -241,7 +239,7 @@ class PlantJudge:
             for row, trace in enumerate(traces):
                 data[name][row, : trace.samples] = trace.data[name][0]
         spec = self.monitor.spec
-        library = library_of(spec)
+        library = spec.imported_texts()
         meta = replace(
             traces[0].meta,
             spec_name=self.monitor.compiled.name,
@@ -249,7 +247,7 @@ class PlantJudge:
             spec_text=spec.source.text,
             spec_library=library,
             spec_set=dict(self.overrides),
-            spec_hash=spec_sha256(spec.source.text, library),
+            spec_hash=spec.sha256,
             seed=traces[0].meta.seed if len(traces) == 1 else None,
             stlc_version=__version__,
         )

@@ -13,9 +13,6 @@ from numpy.typing import NDArray
 from stlc.assurance.plant_judge import PlantJudge
 from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
 from stlc.assurance.simulation import Simulations, Simulator
-from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.discretize import counts_samples
-from stlc.compile.ir.traverse import nodes
 from stlc.diagnostics import SystemFileError
 from stlc.monitor.verdict import Monitor
 from stlc.plants.plant import Plant, PlantFinding, PlantRun
@@ -122,8 +119,7 @@ class PlantSimulator(Simulator):
         compiled = self.monitor.compiled
         read_by = (compiled.requirements[requirement], *compiled.assumptions)
         for rule in read_by:  # one that reads a simulation to its end, whatever its length
-            ahead = (node for node in nodes(rule.formula) if isinstance(node, ir.Windowed) and not node.back)
-            if rule.windowed or rule.uses_end or any(node.window.hi is None for node in ahead):
+            if rule.windowed or rule.uses_end:
                 return 1.0
         if not decl.free:
             return 1.0
@@ -146,7 +142,7 @@ class PlantSimulator(Simulator):
         None too for a requirement that counts samples, which would mean other times there.
         """
         rule = self.monitor.compiled.requirements[requirement]
-        if self._finer is None or counts_samples(rule.typed.formula):
+        if self._finer is None or rule.typed.formula.counts_samples:
             return None
         plant = self._finer.plant
         return _judged(self._finer.monitor, plant.simulate(plant.points_of(points)), requirement)

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from stlc.compile.ir import typed
-from stlc.compile.ir.discretize import Grid, to_window
-from stlc.compile.ir.traverse import nodes
+from stlc.compile.ir.discretize import Grid
 from stlc.diagnostics import Diagnostic
 from stlc.units import time_text
 
@@ -78,26 +77,23 @@ def _guided(formula: typed.Formula) -> Iterator[typed.Formula]:
 
     They stand in `always@[a, end] once[0, c] p`, or in a conjunction in the place of `once`.
     """
-    match formula:
-        case typed.Logic(_, "and", items):
-            for item in items:
-                yield from _guided(item)
-        case typed.Temporal(_, "always", interval, body) if interval.clock == "start" and interval.hi is None:
-            parts = body.items if isinstance(body, typed.Logic) and body.op == "and" else (body,)
-            yield from (part for part in parts if isinstance(part, typed.Temporal) and part.op == "once")
+    for item in formula.joined_by("and"):
+        yield from _guided(item)
+    if formula.word == "always" and formula.on_clock and formula.ahead and formula.ahead.hi is None:
+        (body,) = formula.operands
+        yield from (part for part in body.joined_by("and") or (body,) if part.word == "once")
 
 
 def _late(rule: typed.Requirement, grid: Grid) -> Iterator[Unreached]:
     """Yield the operators of a requirement that are due later than a plan reaches."""
     if grid.dt is None or grid.steps is None:
         return
-    for node in nodes(rule.formula):
-        match node:
-            case typed.Temporal(_, "eventually" | "once", interval) | typed.Until(_, "until", interval):
-                step = to_window(interval, grid, [], outward=False).hi
-            case typed.Temporal(_, "always", interval) if interval.clock == "start":
-                step = to_window(interval, grid, [], outward=True).lo
-            case _:
-                continue
+    for node in rule.formula.temporals():
+        if node.op in ("eventually", "once", "until"):
+            step = grid.window(node.interval, [], outward=False).hi
+        elif node.op == "always" and node.on_clock:
+            step = grid.window(node.interval, [], outward=True).lo
+        else:
+            continue
         if step is not None and step > grid.steps:
-            yield Unreached(rule.name, float(step * grid.dt), interval.clock == "now", node.span)
+            yield Unreached(rule.name, float(step * grid.dt), not node.on_clock, node.span)

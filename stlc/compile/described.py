@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.discretize import Horizon
-from stlc.compile.ir.traverse import nodes
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.jsontext import Num
 from stlc.provenance import sha256
@@ -93,9 +91,8 @@ class CompiledSpec:
 
 def _intervals(rule: CompiledRequirement, dt: float) -> Iterator[WrittenInterval]:
     """Yield the intervals of the temporal operators in a requirement; `dt` is the time step in seconds."""
-    for node in nodes(rule.formula):
-        if isinstance(node, ir.Windowed):
-            low, high = node.window.lo, node.window.hi
-            seconds = (low * dt, None if high is None else high * dt)
-            written, line = (node.span.text, node.span.line) if node.span else ("", None)
-            yield WrittenInterval(node.op, (low, high), seconds, written, line)
+    for node in rule.formula.windows():
+        low, high = node.window.lo, node.window.hi
+        seconds = (low * dt, None if high is None else high * dt)
+        written, line = (node.span.text, node.span.line) if node.span else ("", None)
+        yield WrittenInterval(node.op, (low, high), seconds, written, line)

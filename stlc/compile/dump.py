@@ -10,10 +10,8 @@ from textwrap import wrap
 from typing import Literal, TypeAlias
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.discretize import Grid, duration, in_words
-from stlc.compile.ir.support import columns_in
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.text import show_formula, shown
-from stlc.compile.ir.traverse import nodes
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.escape import screen
 from stlc.grammar.printer import show, show_name
@@ -49,10 +47,10 @@ def _head(compiled: Compiled) -> Iterator[str]:
     grid = compiled.grid
     facts = [show_name(compiled.name)]
     if grid.dt is not None:
-        facts.append(f"dt {in_words(Fraction(1), grid)}")
+        facts.append(f"dt {grid.in_words(Fraction(1))}")
     if grid.horizon is not None:
-        facts.append(f"horizon {duration(grid.horizon, grid)}")
-    facts.append(f"formula horizon {duration(compiled.reach, grid)}")
+        facts.append(f"horizon {grid.duration(grid.horizon)}")
+    facts.append(f"formula horizon {grid.duration(compiled.reach)}")
     yield " · ".join(facts)
 
 
@@ -78,7 +76,7 @@ def _beside(compiled: Compiled) -> Iterator[str]:
 def _became(rule: CompiledRequirement, compiled: Compiled) -> Iterator[str]:
     """Yield texts about a compiled requirement: its formula, its added states, its intervals."""
     yield show_formula(rule.formula)
-    read = columns_in(rule.formula)
+    read = rule.formula.columns
     added = [timer for timer in compiled.timers if timer.name in read]
     if added:
         yield "+ " + ", ".join(
@@ -130,21 +128,21 @@ def _instants(rule: CompiledRequirement, grid: Grid) -> list[str]:
 def _times(rule: CompiledRequirement, grid: Grid) -> Iterator[str]:
     """Yield a line for each distinct interval of a formula: operator, interval in seconds and in samples."""
     seen: set[str] = set()
-    for node in nodes(rule.formula):
-        if isinstance(node, ir.Windowed):
-            line = _interval(node.op, node.window, grid, back=node.back)
-            if line not in seen:
-                seen.add(line)
-                yield line
+    for node in rule.formula.windows():
+        line = _interval(node, grid)
+        if line not in seen:
+            seen.add(line)
+            yield line
 
 
-def _interval(op: str, window: ir.Window, grid: Grid, *, back: bool) -> str:
+def _interval(node: ir.Windowed, grid: Grid) -> str:
+    op, window, back = node.op, node.window, node.back
     end = "start" if back else "end"
-    last = end if window.hi is None else in_words(Fraction(window.hi), grid)
+    last = end if window.hi is None else grid.in_words(Fraction(window.hi))
     samples = f"samples {window.lo}..{end if window.hi is None else window.hi}{' back' if back else ''}"
     if grid.dt is None:
         return f"{op}  {samples}"
-    return f"{op}  [{in_words(Fraction(window.lo), grid)}, {last}] = {samples}"
+    return f"{op}  [{grid.in_words(Fraction(window.lo))}, {last}] = {samples}"
 
 
 def _states(compiled: Compiled) -> Iterator[str]:
@@ -156,6 +154,6 @@ def _states(compiled: Compiled) -> Iterator[str]:
     for timer in compiled.timers:
         yield f"  + {timer.kind:<6}  {shown(timer.name)}  {timer.about}".rstrip()
     if compiled.mission is not None:
-        yield f"  mission   {duration(compiled.mission, compiled.grid)}"
+        yield f"  mission   {compiled.grid.duration(compiled.mission)}"
     safe = ", ".join(show_name(rule.name) for rule in compiled.safety)
     yield f"  phi_safe  {safe or '(no requirement is tagged @safety)'}"

@@ -1,6 +1,6 @@
 """Compiler pipeline: the stages, in order. Read this module first.
 
-    resolve   ast.Spec      -> typed.Spec                 names, types, units; time in seconds
+    resolve   Spec          -> typed.Spec                 names, types, units; time in seconds
     place     typed.Formula -> typed.Formula              delays in samples of a time grid
     augment   typed.Formula -> typed.Formula, Timer…      mission time and the past become added states
     lower     typed.Formula -> ir.Formula                 negation normal form; time in steps
@@ -22,27 +22,23 @@ from typing import Literal, TypeAlias, final
 
 from stlc.compile.augment.augment import Augmented, augment
 from stlc.compile.augment.guidance import guidance_cost
-from stlc.compile.augment.lift import from_first_sample
 from stlc.compile.augment.mission import Goal, mission_steps, never_over
 from stlc.compile.augment.timers import Timer, TimerTable
 from stlc.compile.augment.whole import over_mission
 from stlc.compile.backends.schedule import End
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.resolve import resolve
-from stlc.compile.frontend.tags import nominal
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.discretize import Grid, in_samples, in_words
-from stlc.compile.ir.lower import as_written, lower
+from stlc.compile.ir.discretize import Grid
+from stlc.compile.ir.lower import as_written
 from stlc.compile.ir.ranges import KnownRanges
 from stlc.compile.ir.simplify import simplify
-from stlc.compile.ir.support import columns_in, reach, uses_end
-from stlc.compile.ir.traverse import absolute, margin_unit, mentions_horizon
 from stlc.compile.ir.warnings import jumps
 from stlc.compile.semantics.semantics import Semantics
 from stlc.diagnostics import Diagnostic, SpecError
-from stlc.grammar import ast
 from stlc.grammar.allow import not_allowed
+from stlc.grammar.spec import Spec
 from stlc.signature import Signature
 from stlc.source import Span
 
@@ -99,7 +95,7 @@ class CompiledRequirement:
     @property
     def unit(self) -> str:
         """Unit of the robustness; "" if its predicates have different units."""
-        return margin_unit(self.typed.formula)
+        return self.typed.formula.margin_unit
 
     @property
     def factor(self) -> float:
@@ -140,7 +136,7 @@ class Compiled:
     """
 
     name: str
-    spec: ast.Spec = field(repr=False)
+    spec: Spec = field(repr=False)
     signature: Signature
     requirements: tuple[CompiledRequirement, ...]
     assumptions: tuple[CompiledRequirement, ...]
@@ -177,7 +173,7 @@ class Compiled:
 
 
 def compile_spec(
-    spec: ast.Spec,
+    spec: Spec,
     *,
     grid: Grid,
     interface: Interface | None = None,
@@ -203,7 +199,7 @@ def compile_spec(
 
 
 def resolve_for(
-    spec: ast.Spec, interface: Interface | None, overrides: Mapping[str, str] | None, purpose: Purpose
+    spec: Spec, interface: Interface | None, overrides: Mapping[str, str] | None, purpose: Purpose
 ) -> typed.Spec:
     """Run the first stage of the compiler, which does not depend on the time grid.
 
@@ -214,7 +210,7 @@ def resolve_for(
     """
     overrides = overrides or {}
     if interface is not None and purpose == "check":
-        given = {item.name for item in spec.items if isinstance(item, ast.Param)} & overrides.keys()
+        given = {item.name for item in spec.parameters} & overrides.keys()
         interface = _without(interface, given)
     return resolve(spec, interface=interface, overrides=overrides)
 
@@ -234,7 +230,7 @@ def compile_resolved(
             requirements=tuple(map(as_written, spec.requirements)),
             assumptions=tuple(map(as_written, spec.assumptions)),
         )
-    stage = _Stage(grid, purpose, TimerTable(spec.taken), sink, nominal(spec.signature.columns))
+    stage = _Stage(grid, purpose, TimerTable(spec.taken), sink, spec.signature.nominal)
     requirements = tuple(map(stage.requirement, spec.requirements))
     goals = tuple(stage.goals)
     assumptions = tuple(map(stage.rule, spec.assumptions))
@@ -244,7 +240,7 @@ def compile_resolved(
         errors = [
             _too_far(rule, grid)
             for rule in requirements
-            if _leaves_plan(rule, grid) and not (cut and not reach(rule.formula).past)
+            if _leaves_plan(rule, grid) and not (cut and not rule.formula.reach.past)
         ]
     if errors:
         raise SpecError(*errors)
@@ -291,7 +287,7 @@ class _Stage:
         if self.grid.end is None:
             return self.rule(requirement)
         whole = replace(requirement, formula=over_mission(requirement.formula, self.grid))
-        recurs = mentions_horizon(requirement.formula) and whole != requirement
+        recurs = requirement.formula.mentions_horizon and whole != requirement
         trial = replace(self, table=TimerTable(frozenset()), sink=[], goals=[])
         trial.rule(whole, recurs=recurs)
         if any(finding.severity == "error" for finding in trial.sink):
@@ -300,14 +296,14 @@ class _Stage:
 
     def rule(self, requirement: typed.Requirement, *, recurs: bool = False) -> CompiledRequirement:
         """Compile one requirement or assumption; `recurs`: see `augment`."""
-        written = in_samples(requirement.formula, self.grid, self.sink)
+        written = self.grid.in_samples(requirement.formula, self.sink)
         requirement = replace(requirement, formula=written)
         if self.purpose == "train":
             self.sink.extend(jumps(written, self.ranges))
         rewritten = self._rewritten(requirement, recurs=recurs)
         if rewritten.goal is not None:
             self.goals.append(rewritten.goal)
-        lowered = lower(rewritten.formula, self.grid, self.sink)
+        lowered = self.grid.lower(rewritten.formula, self.sink)
         formula = simplify(lowered)
         return CompiledRequirement(
             name=requirement.name,
@@ -317,11 +313,11 @@ class _Stage:
             scale=requirement.scale,
             formula=formula,
             lowered=lowered,
-            reach=reach(formula).future,
-            windowed=mentions_horizon(written) and not recurs,
-            uses_end=uses_end(formula),
-            absolute=absolute(written),
-            alive=simplify(lower(rewritten.alive, self.grid, self.sink)),
+            reach=formula.reach.future,
+            windowed=written.mentions_horizon and not recurs,
+            uses_end=formula.uses_end,
+            absolute=written.absolute,
+            alive=simplify(self.grid.lower(rewritten.alive, self.sink)),
             span=requirement.span,
             typed=requirement,
         )
@@ -335,14 +331,14 @@ class _Stage:
         if self.purpose == "train":
             return augment(requirement, self.grid, self.table, self.sink, recurs=recurs)
         written = requirement.formula
-        formula = from_first_sample(written) if absolute(written) else written
+        formula = written.from_first_sample() if written.absolute else written
         return Augmented(formula, typed.Truth(written.span, True), None)
 
 
 def _from_start(rule: CompiledRequirement, grid: Grid) -> CompiledRequirement:
-    lowered = lower(from_first_sample(rule.typed.formula), grid, [])
+    lowered = grid.lower(rule.typed.formula.from_first_sample(), [])
     formula = simplify(lowered)
-    return replace(rule, formula=formula, lowered=lowered, reach=reach(formula).future, windowed=False)
+    return replace(rule, formula=formula, lowered=lowered, reach=formula.reach.future, windowed=False)
 
 
 def _remembered(timers: Iterable[Timer]) -> int:
@@ -358,7 +354,7 @@ def _without(interface: Interface, names: Iterable[str]) -> Interface:
 
 def _signature(spec: typed.Spec, rules: Iterable[CompiledRequirement], timers: Iterable[Timer]) -> Signature:
     """Return the signature: signals that requirements read, then the added states."""
-    read = frozenset().union(*(columns_in(rule.formula) for rule in rules))
+    read = frozenset().union(*(rule.formula.columns for rule in rules))
     kept = Signature(tuple(column for column in spec.signature.columns if column.name in read))
     return kept.extended(*(timer.column for timer in timers))
 
@@ -375,14 +371,14 @@ def _leaves_plan(rule: CompiledRequirement, grid: Grid) -> bool:
 def _too_far(rule: CompiledRequirement, grid: Grid) -> Diagnostic:
     horizon = Fraction(grid.steps or 0)
     need = Fraction(rule.reach)
-    if reach(rule.formula).past:
+    if rule.formula.reach.past:
         text = f"`{rule.name}` looks at samples before the start of every plan"
         label = "`prev`, `delta` or `shift` at the first sample"
     elif need <= horizon:
         text = f"`{rule.name}` looks beyond the end of every plan"
         label = "a window of fixed length inside of one that runs to the end"
     else:
-        text = f"`{rule.name}` needs {in_words(need, grid)} of signal, a plan has {in_words(horizon, grid)}"
+        text = f"`{rule.name}` needs {grid.in_words(need)} of signal, a plan has {grid.in_words(horizon)}"
         label = f"looks {rule.reach} steps ahead"
     return Diagnostic(
         "E306",

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from stlc.diagnostics import CODES, usage
 from stlc.files import File
-from stlc.grammar import ast
-from stlc.grammar.manual import CodeList, Page, SpecInWords, in_words, read_page
+from stlc.grammar.manual import CodeList, Page, SpecInWords
+from stlc.grammar.spec import Spec
 from stlc.rundir import RunDir
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ Explained: TypeAlias = "CodeList | Page | SpecInWords | Explanation | Guarantee"
 
 
 def explain(
-    what: str | Path | ast.Spec | Verdict | Run | None = None,
+    what: str | Path | Spec | Verdict | Run | None = None,
     *,
     require: tuple[str, ...] = (),
     guarantee: bool = False,
@@ -56,8 +56,8 @@ def explain(
         return bounds(folder.name, Run.task_in(folder, options.get("overrides")))
     if what is None:
         return CodeList(dict(CODES))
-    if isinstance(what, ast.Spec):
-        return in_words(what, what.source.name, require)
+    if isinstance(what, Spec):
+        return SpecInWords.of(what, what.source.name, require)
     if not isinstance(what, str | Path):
         from stlc.monitor.explain.tree import explanation
         from stlc.monitor.judgement import Verdict
@@ -67,15 +67,13 @@ def explain(
         what = what.dir.path
     name = str(what)
     if _CODE.fullmatch(name) or name in _TOPICS:
-        page = read_page(name if name in _TOPICS else name.upper())
+        page = Page.read(name if name in _TOPICS else name.upper())
         if page is None:
             missing = usage(f"there is no code `{name.upper()}`")
             raise missing.near(name.upper(), CODES, "stlc explain  lists the codes")
         return page
     if name == File.STDIN or File(name).is_spec:
-        from stlc.grammar.parser import parse
-
-        return in_words(parse(File(File(name).spec()).read()), name, require)
+        return SpecInWords.of(Spec.load(name), name, require)
     from stlc.monitor.check import Question, judge
     from stlc.monitor.explain.tree import explanation
 

@@ -17,7 +17,6 @@ import numpy as np
 import torch
 
 from stlc.compile.backends.array.arith import ArrayProgram
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import SystemFileError
 from stlc.dynamics.declaration.functions import FunctionDecl
@@ -101,6 +100,6 @@ def _by_body(body: ir.Body, q: Doubles) -> Doubles:
     The positions are computed from `body`, the expressions of the kinematics.
     """
     args = tuple(ir.Signal(f"a{index}") for index in range(q.shape[1]))
-    program = ArrayProgram({str(i): ir.Extern("f", args, i, body) for i in range(3)})
-    found = program({"": q[:, 0], **{arg.name: q[:, i] for i, arg in enumerate(args)}}, NUMPY)
+    program = ArrayProgram({str(i): call for i, call in enumerate(body.calls_of("f", args))})
+    found = program({"": q[:, 0], **{arg.name: q[:, i] for i, arg in enumerate(args)}})
     return np.stack([np.broadcast_to(found[str(i)], len(q)) for i in range(3)], 1)

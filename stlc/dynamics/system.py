@@ -16,10 +16,8 @@ from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import add, multiply, substitute
-from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.typed import Parameter
-from stlc.compile.semantics.switch import Hard, Switch
+from stlc.compile.semantics.switch import Switch
 from stlc.diagnostics import Diagnostic, SystemFileError, usage
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.motion import Assign
@@ -36,7 +34,6 @@ from stlc.files import File
 from stlc.source import Source
 from stlc.tabular import html_table
 
-HARD = Hard()
 PROBED = 1000
 """Maximum number of steps of a probe: divergence shows early, and a horizon may be long."""
 
@@ -206,10 +203,10 @@ class System:
 
     # -------------------------------------------------------------------- motion
 
-    def step(self, x: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
+    def step(self, x: Tensor, u: Tensor, switch: Switch | None = None) -> Tensor:
         """Make one step from states `x` (B, n) under planned controls `u` (B, m).
 
-        Returns the next states (B, n). `switch` selects exact jumps or their smooth blends.
+        Returns the next states (B, n). `switch` selects smooth blends of jumps, which are exact by default.
         """
         before = self._named(x)
         moved = self._stepper(switch).step(before | self._inputs(u), TORCH, switch)
@@ -254,7 +251,7 @@ class System:
         """
         if self._commands is None:
             return u
-        found = self._commands({**self._named(x), **self._inputs(u)}, TORCH, HARD)
+        found = self._commands({**self._named(x), **self._inputs(u)}, TORCH)
         return torch.stack([found[name] for name in self.control_names], 1)
 
     def planned(self, x: Tensor, command: Tensor) -> Tensor:
@@ -276,19 +273,19 @@ class System:
         found = self.decl.commands
         return ArrayProgram(found) if found else None
 
-    def rollout(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
+    def rollout(self, x0: Tensor, u: Tensor, switch: Switch | None = None) -> Tensor:
         """Roll out from states `x0` (B, n) under plans `u` (B, T, m); return the states (B, T+1, n).
 
-        The initial state comes first. `switch` selects exact jumps or their smooth blends.
+        The initial state comes first. `switch` selects smooth blends of jumps, which are exact by default.
         """
         columns = self.rollout_columns(x0, u, switch)
         return torch.stack([columns[name].t() for name in self.names], 2)
 
-    def rollout_columns(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Columns:
+    def rollout_columns(self, x0: Tensor, u: Tensor, switch: Switch | None = None) -> Columns:
         """Roll out from states `x0` (B, n) under plans `u` (B, T, m); return state -> values (T+1, B).
 
-        The tensor of a constant state is an expanded view. `switch` selects exact jumps or their smooth
-        blends.
+        The tensor of a constant state is an expanded view. `switch` selects smooth blends of
+        jumps, which are exact by default.
         """
         sizes = {"states": len(self.names), "controls": len(self.control_names)}
         check_plans(self.decl.name, tuple(x0.shape), tuple(u.shape), **sizes)
@@ -328,8 +325,8 @@ class System:
         step = build_step(self.decl, soft=False)
         return ModelStep(step.lets, {**step.next, **{timer.name: timer.update for timer in self.timers}})
 
-    def _stepper(self, switch: Switch) -> Stepper:
-        soft = not switch.exact
+    def _stepper(self, switch: Switch | None) -> Stepper:
+        soft = switch is not None and not switch.exact
         if soft not in self._steppers:
             self._steppers[soft] = Stepper(build_step(self.decl, soft=soft))
         return self._steppers[soft]
@@ -379,7 +376,7 @@ class System:
         """
         if self._observation is None:
             return x
-        seen = self._observation(self._named(x), TORCH, HARD)
+        seen = self._observation(self._named(x), TORCH)
         return torch.stack([seen[str(i)].expand(x.shape[:-1]) for i in range(self.observed_count)], -1)
 
     @cached_property
@@ -404,7 +401,7 @@ class System:
         `u` are the commands that the actuators receive. Raises UsageError (U101) if the file declares no
         reward.
         """
-        found: Tensor = self._reward({**self._named(after), **self._inputs(u)}, TORCH, HARD)["reward"]
+        found: Tensor = self._reward({**self._named(after), **self._inputs(u)}, TORCH)["reward"]
         return found.expand(len(after))
 
     @cached_property
@@ -434,7 +431,7 @@ class System:
         sat: Tensor,
         rho: Tensor | None = None,
         u: Tensor | None = None,
-        switch: Switch = HARD,
+        switch: Switch | None = None,
     ) -> Tensor:
         """The weighted performance terms of the objective, averaged over time: (B,), differentiable.
 
@@ -443,7 +440,7 @@ class System:
             sat: 1 if the trajectory satisfies the specification, else 0, (B,); without gradient.
             rho: robustness, (B,), for terms that read it; 0 by default.
             u: controls, (B, T, m), for terms that read a control; such terms are averaged over the T steps.
-            switch: whether `ind(…)` in a term is an exact or a smooth indicator.
+            switch: form of smooth indicators `ind(…)` in the terms; None: exact ones.
         """
         if self.cost.controlled and u is None:
             raise ValueError(f"the objective of {self.decl.name} needs the controls")
@@ -470,10 +467,10 @@ class System:
         given = self.decl.commands
         for term in self.decl.objective.terms:
             if term.weight:
-                kind = bool(columns_in(term.value) & set(self.control_names))
-                value = multiply(ir.Const(term.weight), substitute(term.value, given) if kind else term.value)
+                kind = bool(term.value.columns & set(self.control_names))
+                value = term.weight * (term.value.substitute(given) if kind else term.value)
                 before = sums[kind]
-                sums[kind] = value if before is None else add(before, value)
+                sums[kind] = value if before is None else before + value
         return sums[0], sums[1]
 
     # -------------------------------------------------------------------- health

@@ -19,9 +19,9 @@ from stlc.editor.symbols import inside
 from stlc.editor.vocabulary import BUILT_IN, FUNCTIONS, KEYWORDS, TAGS, TEMPORAL, TYPES
 from stlc.grammar import ast
 from stlc.grammar.printer import own_name
-from stlc.grammar.scan import declaration_starts, lexemes
+from stlc.grammar.scan import Lexeme, declaration_starts
 from stlc.grammar.tables import acceptable
-from stlc.grammar.words import BINARY_TEMPORAL, PRAGMAS, RESERVED, ROLES, UNARY_TEMPORAL
+from stlc.grammar.words import OPERATORS, PRAGMAS, RESERVED, ROLES
 from stlc.units import Unit
 
 OfferKind: TypeAlias = Literal[
@@ -42,8 +42,8 @@ _TERMINALS = {
     "_NOT_IN": ("not in",),
     "QUANTIFIER": ("forall", "exists"),
     "ROLE": tuple(ROLES),
-    "UNARY": tuple(dict.fromkeys(UNARY_TEMPORAL.values())),
-    "BINARY": tuple(dict.fromkeys(BINARY_TEMPORAL.values())),
+    "UNARY": tuple(dict.fromkeys(each.name for each in OPERATORS.values() if not each.binary)),
+    "BINARY": tuple(dict.fromkeys(each.name for each in OPERATORS.values() if each.binary)),
 }
 """Words of a terminal of the grammar, in the spelling that the language prefers."""
 _KINDS: dict[str, OfferKind] = {
@@ -156,8 +156,8 @@ def _fitting(document: Document, offset: int, piece: str, accepted: frozenset[st
 def _everything(document: Document, offset: int) -> Iterator[Offer]:
     yield from _names(document, offset)
     yield from _functions()
-    aliases = {**UNARY_TEMPORAL, **BINARY_TEMPORAL}
-    words = sorted(word for word in RESERVED if aliases.get(word, word) == word)
+    aliases = {word for word, each in OPERATORS.items() if word != each.name}
+    words = sorted(RESERVED - aliases)
     yield from (Offer(word, "Keyword", doc=KEYWORDS.get(word, ""), order=7) for word in words)
 
 
@@ -185,7 +185,7 @@ def _new_names(document: Document, piece: str) -> Iterator[Offer]:
     arrow, types are proposed. In a signal declaration, the states of the system that are not yet declared are
     proposed.
     """
-    words = [lexeme.text for lexeme in lexemes(piece)]
+    words = [lexeme.text for lexeme in Lexeme.scan(piece)]
     if words[-1:] in ([":"], [">"], ["->"]):
         yield from (Offer(name, "Class", text) for name, text in TYPES.items())
         yield from (Offer(own_name(name), "Class", "enum") for name in document.names.types)

@@ -13,26 +13,21 @@ from stlc.compile.frontend.declare import ranged
 from stlc.compile.frontend.evaluate import evaluate
 from stlc.compile.frontend.expressions import resolve_formula
 from stlc.compile.frontend.interface import Interface
-from stlc.compile.frontend.modules import Module, load_modules
 from stlc.compile.frontend.resolve import declared
 from stlc.compile.frontend.scope import Definition, Failed, Known, Scope
 from stlc.compile.frontend.values import Value
 from stlc.compile.ir import typed
-from stlc.compile.ir.discretize import Grid, to_window
-from stlc.compile.ir.lower import lower
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.nodes import Window
 from stlc.compile.ir.simplify import simplify
-from stlc.compile.ir.support import reach
-from stlc.compile.ir.traverse import nodes
 from stlc.diagnostics import Diagnostic, SpecError, StlcError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.load import load_system_decl
 from stlc.editor.symbols import Symbol, SymbolNames, names_of
 from stlc.files import File
 from stlc.grammar import ast
-from stlc.grammar.parser import parse
-from stlc.grammar.scan import declaration_starts, lexemes
-from stlc.grammar.traverse import descendants
+from stlc.grammar.scan import Lexeme, declaration_starts
+from stlc.grammar.spec import Module, Spec
 from stlc.lint.lint import Surroundings, lint
 from stlc.monitor.facts.findings import findings_on
 from stlc.signature import Column
@@ -72,7 +67,7 @@ class Document:
     """
 
     source: Source
-    spec: ast.Spec = field(repr=False)
+    spec: Spec = field(repr=False)
     unread: tuple[Diagnostic, ...]
     system: SystemDecl | None
     missing: tuple[Diagnostic, ...]
@@ -92,7 +87,7 @@ class Document:
     def modules(self) -> tuple[Module, ...]:
         """Imported modules; empty if any of their files cannot be read."""
         try:
-            return load_modules(self.spec)
+            return self.spec.modules()
         except StlcError:
             return ()
 
@@ -180,13 +175,13 @@ _ROUNDS = 8
 _INK = re.compile(r"[^\n]")
 
 
-def read(source: Source) -> tuple[ast.Spec, tuple[Diagnostic, ...]]:
+def read(source: Source) -> tuple[Spec, tuple[Diagnostic, ...]]:
     """Parse a text; return the tree of all declarations without syntax errors, and diagnostics of the others.
 
     Source locations in the tree are valid for `source`: declarations with errors are blanked, not cut out.
     """
     try:
-        return parse(source), ()
+        return Spec.parse(source), ()
     except SpecError as error:
         findings = error.diagnostics
     kept = source
@@ -194,10 +189,10 @@ def read(source: Source) -> tuple[ast.Spec, tuple[Diagnostic, ...]]:
     for _ in range(_ROUNDS):
         kept = _without(kept, faults)
         try:
-            return parse(kept), findings
+            return Spec.parse(kept), findings
         except SpecError as error:
             faults = error.diagnostics
-    return parse(Source(source.name, _INK.sub(" ", source.text))), findings
+    return Spec.parse(Source(source.name, _INK.sub(" ", source.text))), findings
 
 
 def _without(source: Source, faults: tuple[Diagnostic, ...]) -> Source:
@@ -266,10 +261,10 @@ class Meaning:
         if formula is None:
             return None
         sink: list[Diagnostic] = []
-        lowered = lower(formula, self.grid, sink)
+        lowered = self.grid.lower(formula, sink)
         if any(finding.severity == "error" for finding in sink):
             return None
-        return reach(simplify(lowered)).future
+        return simplify(lowered).reach.future
 
     def interval(self, span: Span) -> tuple[typed.Interval, Window | None] | None:
         """Return the interval of the temporal operator that is written at `span`, and its window in steps.
@@ -278,16 +273,16 @@ class Meaning:
         resolved.
         """
         for formula in self.formulas.values():
-            for node in nodes(formula):
-                if isinstance(node, typed.Temporal | typed.Until) and node.interval.span == span:
+            for node in formula.temporals():
+                if node.interval.span == span:
                     sink: list[Diagnostic] = []
-                    window = to_window(node.interval, self.grid, sink, outward=node.op in _OUTWARD)
+                    window = self.grid.window(node.interval, sink, outward=node.op in _OUTWARD)
                     return node.interval, None if any(one.severity == "error" for one in sink) else window
         return None
 
 
 def understand(
-    spec: ast.Spec, modules: tuple[Module, ...], *, interface: Interface | None, grid: Grid
+    spec: Spec, modules: tuple[Module, ...], *, interface: Interface | None, grid: Grid
 ) -> Meaning:
     """Resolve the names of a specification as far as possible.
 
@@ -309,7 +304,7 @@ def _ranged(
         return plain
 
 
-def _formulas(spec: ast.Spec, meaning: Meaning) -> dict[str, typed.Formula]:
+def _formulas(spec: Spec, meaning: Meaning) -> dict[str, typed.Formula]:
     """Return the formulas of a specification by name.
 
     If a requirement and a definition have the same name, the name stands for the formula of the requirement.
@@ -318,14 +313,13 @@ def _formulas(spec: ast.Spec, meaning: Meaning) -> dict[str, typed.Formula]:
     for item in spec.items:
         if isinstance(item, ast.Def):
             value = meaning.value(item.name)
-            if isinstance(value, typed.Node):
+            if isinstance(value, typed.Formula):
                 found[item.name] = value
-    for item in spec.items:
-        if isinstance(item, ast.Require | ast.Assume):
-            try:
-                found[item.name] = resolve_formula(item.formula, meaning.scope)
-            except Failed:
-                continue
+    for item in spec.rules:
+        try:
+            found[item.name] = resolve_formula(item.formula, meaning.scope)
+        except Failed:
+            continue
     return found
 
 
@@ -344,23 +338,23 @@ class Borrowed:
 
     span: Span
     module: Module
-    item: ast.Item | None
+    item: ast.Declaration | None
 
 
-def shared(module: Module) -> tuple[ast.Item, ...]:
+def shared(module: Module) -> tuple[ast.Declaration, ...]:
     """Return the declarations of a module that can be imported: all but its requirements."""
-    return tuple(item for item in module.spec.items if not isinstance(item, ast.Require | ast.Assume))
+    return module.spec.vocabulary
 
 
-def borrowed_at(spec: ast.Spec, modules: tuple[Module, ...], offset: int) -> Borrowed | None:
+def borrowed_at(spec: Spec, modules: tuple[Module, ...], offset: int) -> Borrowed | None:
     """Return the imported name under the cursor at `offset`, or None."""
     by_alias = {module.alias: module for module in modules}
-    for node in (part for item in spec.items for part in descendants(item)):
+    for node in (part for item in spec.items for part in item.walk()):
         if not isinstance(node, ast.Attr) or not isinstance(node.base, ast.Name):
             continue
         if node.base.name not in by_alias:
             continue
-        words = list(lexemes(node.span.source.text, node.base.span.end, node.span.end))
+        words = list(Lexeme.scan(node.span.source.text, node.base.span.end, node.span.end))
         span = node.span.source.span(words[-1].start, words[-1].end)
         if span.start <= offset <= span.end:
             module = by_alias[node.base.name]

@@ -7,10 +7,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
 
-from stlc.compile.frontend.modules import STD
 from stlc.compile.frontend.values import Number, Value, VectorValue, describe
 from stlc.compile.ir import typed
-from stlc.compile.ir.discretize import Grid, duration, in_words
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.nodes import Window
 from stlc.editor.document import Document, borrowed_at
 from stlc.editor.symbols import Symbol
@@ -18,14 +17,14 @@ from stlc.editor.vocabulary import BUILT_IN, FUNCTIONS, KEYWORDS, TAGS, TEMPORAL
 from stlc.escape import markdown, screen, visible
 from stlc.grammar import ast
 from stlc.grammar.printer import show
-from stlc.grammar.scan import Lexeme, lexemes
-from stlc.grammar.traverse import descendants
-from stlc.grammar.words import BINARY_TEMPORAL, OPERATORS, UNARY_TEMPORAL
+from stlc.grammar.scan import Lexeme
+from stlc.grammar.spec import STD, Spec
+from stlc.grammar.words import OPERATORS
 from stlc.signature import Column
 from stlc.source import Span
 from stlc.units import time_text
 
-_ALIASES = {**UNARY_TEMPORAL, **BINARY_TEMPORAL}
+_ALIASES = {word: each.name for word, each in OPERATORS.items()}
 
 
 def hover(document: Document, offset: int) -> tuple[Span, str] | None:
@@ -53,7 +52,7 @@ def _lexeme(text: str, offset: int) -> tuple[Lexeme | None, str]:
     At the boundary of two lexemes, a word or number takes precedence over a sign.
     """
     found, before, last = None, "", ""
-    for lexeme in lexemes(text):
+    for lexeme in Lexeme.scan(text):
         if lexeme.start > offset:
             break
         if lexeme.end >= offset and (found is None or found.kind == "sign"):
@@ -88,9 +87,9 @@ def _about_word(document: Document, word: str, *, tag: bool) -> str | None:
 
 def _grid_value(word: str, grid: Grid) -> str:
     if word == "dt" and grid.dt is not None:
-        return f"\n\n{in_words(Fraction(1), grid)}"
+        return f"\n\n{grid.in_words(Fraction(1))}"
     if word == "T" and grid.horizon is not None:
-        return f"\n\n{duration(grid.horizon, grid)}"
+        return f"\n\n{grid.duration(grid.horizon)}"
     return ""
 
 
@@ -107,7 +106,7 @@ def about(document: Document, symbol: Symbol) -> str:
     return "\n\n".join(parts)
 
 
-def _code(item: ast.Item) -> str:
+def _code(item: ast.Declaration) -> str:
     """Return a declaration as a fenced Markdown code block; back quotes in names do not end the block."""
     return f"```stlc\n{screen(show(replace(item, doc='', tags=())))}\n```"
 
@@ -116,7 +115,7 @@ def _comment(doc: str) -> str:
     return "\n".join(map(markdown, doc.split("\n")))
 
 
-def about_shared(item: ast.Item, key: str) -> str:
+def about_shared(item: ast.Declaration, key: str) -> str:
     """Return the hover text of a declaration `item` in an imported file.
 
     `key` is the name of the file, or the key of the standard library.
@@ -139,14 +138,14 @@ def _facts(document: Document, symbol: Symbol) -> Iterator[str]:
             value = document.meaning.value(symbol.name)
             if value is not None:
                 steps = document.meaning.steps(symbol.name)
-                ahead = f", looks {duration(steps, document.grid)} ahead" if steps else ""
+                ahead = f", looks {document.grid.duration(steps)} ahead" if steps else ""
                 yield f"{describe(value)}{_constant(value)}{ahead}"
         case "require" | "assume":
             tags = getattr(symbol.item, "tags", ())
             yield " ".join(("requirement" if symbol.kind == "require" else "assumption", *map(show, tags)))
             steps = document.meaning.steps(symbol.name)
             if steps is not None:
-                yield f"horizon {duration(steps, document.grid)}"
+                yield f"horizon {document.grid.duration(steps)}"
         case "member":
             item = symbol.item
             value_ = dict(item.members).get(symbol.name) if isinstance(item, ast.Enum) else None
@@ -198,10 +197,10 @@ def _amount(number: Number) -> str:
 # ------------------------------------------------------------------- temporal words
 
 
-def _temporal_at(spec: ast.Spec, offset: int) -> ast.Temporal | ast.Until | None:
+def _temporal_at(spec: Spec, offset: int) -> ast.Temporal | ast.Until | None:
     """Return the innermost temporal operator whose word or interval is under the cursor, or None."""
     found = None
-    for node in descendants(spec):
+    for node in spec.walk():
         if not isinstance(node, ast.Temporal | ast.Until):
             continue
         first = node.span.start if isinstance(node, ast.Temporal) else node.left.span.end + 1
@@ -234,9 +233,9 @@ def _time(op: str, interval: typed.Interval, window: Window | None, grid: Grid) 
         samples += " of the mission"
     if grid.dt is None:
         return samples
-    last = "end" if window.hi is None else in_words(Fraction(window.hi), grid)
+    last = "end" if window.hi is None else grid.in_words(Fraction(window.hi))
     opening, closing = "(" if interval.lo_open else "[", ")" if interval.hi_open else "]"
-    lo = _seconds(interval.lo, grid) or in_words(Fraction(window.lo), grid)
+    lo = _seconds(interval.lo, grid) or grid.in_words(Fraction(window.lo))
     hi = last if interval.hi is None else _seconds(interval.hi, grid) or last
     return f"{opening}{lo}, {hi}{closing} = {samples}"
 

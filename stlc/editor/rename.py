@@ -9,8 +9,8 @@ from stlc.diagnostics import SpecError
 from stlc.editor.document import Document
 from stlc.editor.symbols import Occurrence, SymbolNames, names_of
 from stlc.grammar import ast
-from stlc.grammar.parser import parse
 from stlc.grammar.printer import own_name
+from stlc.grammar.spec import Spec
 from stlc.lint.lint import Edit, edited
 from stlc.source import Source, Span
 
@@ -60,7 +60,7 @@ def rename(document: Document, offset: int, new: str) -> tuple[Edit, ...]:
     return tuple(edits)
 
 
-def _column(document: Document, item: ast.Item | None, name: str) -> list[Edit]:
+def _column(document: Document, item: ast.Declaration | None, name: str) -> list[Edit]:
     """Return the edit that adds `from "old"` to the declaration of a renamed signal; [] for other symbols.
 
     With this addition, the signal still reads the state (or column of a trace) that has the old name.
@@ -82,7 +82,7 @@ def _refuse_capture(document: Document, edits: Sequence[Edit], name: str) -> Non
     """
     text = edited(document.source.text, edits)
     try:
-        after = names_of(parse(Source(document.source.name, text)))
+        after = names_of(Spec.parse(Source(document.source.name, text)))
     except SpecError as error:
         raise RenameError(f"`{name}` cannot stand everywhere: {error.diagnostics[0].message}") from None
     if _bindings(after) != _bindings(document.names) or _declared(after) != _declared(document.names):

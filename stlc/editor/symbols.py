@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias, cast
 
 from stlc.grammar import ast
-from stlc.grammar.scan import Lexeme, lexemes
-from stlc.grammar.traverse import children, descendants
+from stlc.grammar.scan import Lexeme
+from stlc.grammar.spec import Spec
 from stlc.source import Span
 
 Kind: TypeAlias = Literal[
@@ -28,7 +28,7 @@ Kind: TypeAlias = Literal[
 ]
 
 
-def _kind(item: ast.Item) -> Kind:
+def _kind(item: ast.Declaration) -> Kind:
     return cast("Kind", type(item).__name__.lower())
 
 
@@ -46,7 +46,7 @@ class Symbol:
     name: str
     kind: Kind
     span: Span
-    item: ast.Item | None = field(default=None, compare=False, repr=False)
+    item: ast.Declaration | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ class SymbolNames:
 Scope: TypeAlias = Mapping[str, Symbol]
 
 
-def names_of(spec: ast.Spec) -> SymbolNames:
+def names_of(spec: Spec) -> SymbolNames:
     """Return the symbols of a specification and their occurrences.
 
     If a name is declared several times, the first declaration counts. The others are listed as further
@@ -104,7 +104,7 @@ def names_of(spec: ast.Spec) -> SymbolNames:
         symbol = _module(module)
         values.setdefault(symbol.name, symbol)
     for item in spec.items:
-        space = {ast.Enum: types, ast.Require: rules, ast.Assume: rules}.get(type(item), values)
+        space = {"enum": types, "requirement": rules, "assumption": rules}.get(item.noun, values)
         space.setdefault(item.name, Symbol(item.name, _kind(item), item.name_span, item))
         if isinstance(item, ast.Enum):
             for lexeme in _member_names(item):
@@ -116,7 +116,7 @@ def names_of(spec: ast.Spec) -> SymbolNames:
     return replace(names, occurrences=tuple(ordered))
 
 
-def inside(spec: ast.Spec, offset: int) -> tuple[Symbol, ...]:
+def inside(spec: Spec, offset: int) -> tuple[Symbol, ...]:
     """Return the arguments and bound variables in scope at `offset`, those of outer expressions first."""
     found: list[Symbol] = []
     for item in spec.items:
@@ -124,7 +124,7 @@ def inside(spec: ast.Spec, offset: int) -> tuple[Symbol, ...]:
             found.extend(_arguments(item).values())
             found.extend(
                 symbol
-                for node in descendants(item)
+                for node in item.walk()
                 if node.span.start <= offset <= node.span.end
                 for symbol in _bound(node).values()
             )
@@ -134,7 +134,7 @@ def inside(spec: ast.Spec, offset: int) -> tuple[Symbol, ...]:
 # ------------------------------------------------------------------------- symbols
 
 
-def _symbol(lexeme: Lexeme, kind: Kind, near: Span, item: ast.Item | None = None) -> Symbol:
+def _symbol(lexeme: Lexeme, kind: Kind, near: Span, item: ast.Declaration | None = None) -> Symbol:
     return Symbol(lexeme.text.strip("`"), kind, near.source.span(lexeme.start, lexeme.end), item)
 
 
@@ -142,7 +142,7 @@ def _words(span: Span, start: int | None = None, end: int | None = None) -> list
     """Return the words in a source location, or in the part of it from offset `start` to offset `end`."""
     first = span.start if start is None else start
     last = span.end if end is None else end
-    return [one for one in lexemes(span.source.text, first, last) if one.kind in ("word", "quoted")]
+    return [one for one in Lexeme.scan(span.source.text, first, last) if one.kind in ("word", "quoted")]
 
 
 def _module(module: ast.Import) -> Symbol:
@@ -156,13 +156,13 @@ def _module(module: ast.Import) -> Symbol:
 
 def _member_names(item: ast.Enum) -> Iterator[Lexeme]:
     before = ""
-    for lexeme in lexemes(item.span.source.text, item.name_span.end, item.span.end):
+    for lexeme in Lexeme.scan(item.span.source.text, item.name_span.end, item.span.end):
         if lexeme.kind in ("word", "quoted") and before in ("{", ","):
             yield lexeme
         before = lexeme.text
 
 
-def _arguments(item: ast.Item) -> dict[str, Symbol]:
+def _arguments(item: ast.Declaration) -> dict[str, Symbol]:
     if not isinstance(item, ast.Def | ast.Extern):
         return {}
     return {
@@ -188,7 +188,7 @@ def _bound(node: ast.Node) -> dict[str, Symbol]:
 # --------------------------------------------------------------------- occurrences
 
 
-def _all(spec: ast.Spec, names: SymbolNames) -> Iterator[Occurrence]:
+def _all(spec: Spec, names: SymbolNames) -> Iterator[Occurrence]:
     for module in spec.imports:
         symbol = _module(module)
         yield Occurrence(symbol.span, symbol)
@@ -196,7 +196,7 @@ def _all(spec: ast.Spec, names: SymbolNames) -> Iterator[Occurrence]:
         yield from _of_item(item, names)
 
 
-def _of_item(item: ast.Item, names: SymbolNames) -> Iterator[Occurrence]:
+def _of_item(item: ast.Declaration, names: SymbolNames) -> Iterator[Occurrence]:
     own = Symbol(item.name, _kind(item), item.name_span, item)
     yield Occurrence(item.name_span, own)
     if isinstance(item, ast.Enum):
@@ -206,7 +206,7 @@ def _of_item(item: ast.Item, names: SymbolNames) -> Iterator[Occurrence]:
     arguments = _arguments(item)
     yield from (Occurrence(symbol.span, symbol) for symbol in arguments.values())
     scope = {**names.values, **arguments}
-    for part in children(item):
+    for part in item.children():
         yield from _uses(part, scope, names)
 
 
@@ -233,7 +233,7 @@ def _uses(node: ast.Node, scope: Scope, names: SymbolNames) -> Iterator[Occurren
             pass
     bound = _bound(node)
     yield from (Occurrence(symbol.span, symbol) for symbol in bound.values())
-    for part in children(node):
+    for part in node.children():
         inner = isinstance(node, ast.Quantifier | ast.Freeze) and part is node.body
         yield from _uses(part, {**scope, **bound} if inner else scope, names)
 

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from stlc.compile.ir.functions import FUNCTIONS as TABLE
 from stlc.grammar.words import OPERATORS
 
-TEMPORAL: Mapping[str, str] = MappingProxyType({name: word.meaning for name, word in OPERATORS.items()})
+TEMPORAL: Mapping[str, str] = MappingProxyType({word.name: word.meaning for word in OPERATORS.values()})
 
 BUILT_IN: Mapping[str, str] = MappingProxyType(
     {

@@ -38,8 +38,6 @@ def control_images(task: Task) -> dict[str, ir.Num]:
     for each in task.system.decl.controls:
         image = images.get(each.name, ir.Signal(each.name))
         if each.squash == "angle":
-            low = ir.Const(each.low)
-            turned = ir.Op("mod", (ir.Op("sub", (image, low)), ir.Const(2.0 * math.pi)))
-            image = ir.Op("add", (turned, low))
+            image = (image - each.low) % (2.0 * math.pi) + each.low
         found[each.name] = image
     return found

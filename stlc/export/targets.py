@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from stlc.controller.run.run import Run
     from stlc.export.monitor import ExportedMonitor
     from stlc.export.write import Exported
-    from stlc.grammar import ast
+    from stlc.grammar.spec import Spec
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +47,7 @@ class ExportOptions(Options):
 
 
 @Options.taking(ExportOptions)
-def export(what: Run | ast.Spec | Path | str, options: ExportOptions) -> Exported | ExportedMonitor:
+def export(what: Run | Spec | Path | str, options: ExportOptions) -> Exported | ExportedMonitor:
     """Export the controller of a run, with its monitor, or the monitor of a specification as C.
 
     Args:
@@ -59,15 +59,15 @@ def export(what: Run | ast.Spec | Path | str, options: ExportOptions) -> Exporte
         RunError: R105, the export disagrees with the run; nothing is written.
         MissingError: R301, the target needs packages that are not installed.
     """
-    from stlc.grammar import ast
+    from stlc.grammar.spec import Spec
 
     to, out = options.to, options.out
-    is_spec = isinstance(what, ast.Spec) or File(str(what)).is_spec
+    is_spec = isinstance(what, Spec) or File(str(what)).is_spec
     if to == "c" and is_spec:
         from stlc.export.monitor import export_monitor
         from stlc.monitor.verdict import Monitor
 
-        spec = what if isinstance(what, ast.Spec) else File(str(what)).spec()
+        spec = what if isinstance(what, Spec) else File(str(what)).spec()
         monitor = Monitor(spec, options.dt, system=options.system, overrides=options.overrides)
         at: Any = options.at
         if at is not None and at.isdecimal():
@@ -81,7 +81,7 @@ def export(what: Run | ast.Spec | Path | str, options: ExportOptions) -> Exporte
         or options.at
         or options.system
         or options.overrides
-        or isinstance(what, ast.Spec)
+        or isinstance(what, Spec)
     ):
         advice = "stlc export SPEC.stl --to c"
         raise usage("`--float`, `--dt`, `--at`, `--system` and `--set` belong to a monitor", advice)

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from stlc.diagnostics import CODES, Diagnostic
-from stlc.grammar.scan import comments, declaration_starts, lexemes
+from stlc.grammar.scan import Lexeme, comments, declaration_starts
 from stlc.source import Source, Span
 
 _DIRECTIVE = re.compile(r"(?:#+|/{2,})[ \t]*stlc:[ \t]*(?P<word>\w*)(?P<codes>(?:[ \t,]+[A-Za-z]\d+\b)*)")
@@ -96,7 +96,7 @@ def _declaration(comment: Span) -> Span:
     """
     source = comment.source
     text = source.text
-    items = list(lexemes(text))
+    items = list(Lexeme.scan(text))
     starts = declaration_starts(text)
     after = bisect_left(items, comment.end, key=lambda item: item.start)
     alone = not text[text.rfind("\n", 0, comment.start) + 1 : comment.start].strip()

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 from stlc.grammar import ast
-from stlc.grammar.scan import Lexeme, lexemes
-from stlc.grammar.traverse import children, descendants
+from stlc.grammar.scan import Lexeme
+from stlc.grammar.spec import Spec
 from stlc.source import Span
 
 AmbiguityKind: TypeAlias = Literal["scope", "mixed", "chain", "until", "implication"]
@@ -40,7 +40,7 @@ class Ambiguity:
     outer: str
 
 
-def ambiguities(spec: ast.Spec, *, implications: bool = False) -> Iterator[Ambiguity]:
+def ambiguities(spec: Spec, *, implications: bool = False) -> Iterator[Ambiguity]:
     """Yield the parts of formulas that other tools parse differently, in source order.
 
     Args:
@@ -48,7 +48,7 @@ def ambiguities(spec: ast.Spec, *, implications: bool = False) -> Iterator[Ambig
         implications: whether to include the kind "implication".
     """
     words = _Words(spec)
-    pairs = [node for node in descendants(spec) if isinstance(node, ast.Logic | ast.Until)]
+    pairs = [node for node in spec.walk() if isinstance(node, ast.Logic | ast.Until)]
     clashes = [
         Ambiguity(operand.span, kind, node.op)
         for node in pairs
@@ -69,8 +69,8 @@ class _Words:
     parentheses.
     """
 
-    def __init__(self, spec: ast.Spec) -> None:
-        self.items: list[Lexeme] = list(lexemes(spec.source.text))
+    def __init__(self, spec: Spec) -> None:
+        self.items: list[Lexeme] = list(Lexeme.scan(spec.source.text))
         self.starts = [item.start for item in self.items]
         self.parenthesised: set[tuple[int, int]] = set()
 
@@ -112,7 +112,7 @@ def _scope(node: ast.Logic | ast.Until, words: _Words) -> Iterator[Ambiguity]:
         if isinstance(part, ast.Temporal):
             yield Ambiguity((governed or part).span, "scope", node.op)
             return
-        *_, last = (None, *children(part))
+        *_, last = (None, *part.children())
         if last is None or last.span.end < part.span.end:
             return
         governed = None if isinstance(part, ast.Logic | ast.Until) else governed or part

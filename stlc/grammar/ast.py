@@ -6,12 +6,12 @@ comparisons of nodes ignore.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields
 from fractions import Fraction
-from typing import Literal, TypeAlias
+from typing import ClassVar, Literal, TypeAlias
 
-from stlc.source import Source, Span
+from stlc.source import Span
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +19,29 @@ class Node:
     """Base class of all nodes of the syntax tree; `span` is the location of the node's text in the source."""
 
     span: Span = field(compare=False, repr=False)
+    is_formula: ClassVar[bool] = False
+    """Whether the node is a formula by its form, whatever its operands are."""
+
+    def children(self) -> Iterator[Node]:
+        """Yield the nodes directly below the node, in source order."""
+        for part in fields(self):
+            yield from _nodes_in(getattr(self, part.name))
+
+    def walk(self) -> Iterator[Node]:
+        """Yield the node and all nodes below it, in source order, outermost first."""
+        stack: list[Node] = [self]
+        while stack:
+            top = stack.pop()
+            yield top
+            stack.extend(reversed(list(top.children())))
+
+
+def _nodes_in(value: object) -> Iterator[Node]:
+    if isinstance(value, Node):
+        yield value
+    elif isinstance(value, tuple):
+        for item in value:
+            yield from _nodes_in(item)
 
 
 # ------------------------------------------------------------------ expressions
@@ -43,6 +66,7 @@ class String(Node):
 class Bool(Node):
     """`true` or `false`."""
 
+    is_formula: ClassVar = True
     value: bool
 
 
@@ -121,6 +145,7 @@ Comparison: TypeAlias = Literal["<", "<=", ">", ">=", "==", "!="]
 class Compare(Node):
     """Chain of comparisons: `a <= b < c` has three operands and two operators."""
 
+    is_formula: ClassVar = True
     operands: tuple[Expr, ...]
     ops: tuple[Comparison, ...]
 
@@ -132,6 +157,7 @@ class Member(Node):
     The right side is an expression, a range `[lo, hi]` or a set `{1, 2}`.
     """
 
+    is_formula: ClassVar = True
     item: Expr
     region: Expr | SetLiteral
     negated: bool = False
@@ -148,6 +174,7 @@ class SetLiteral(Node):
 class Not(Node):
     """Negation `not operand`."""
 
+    is_formula: ClassVar = True
     operand: Expr
 
 
@@ -155,6 +182,7 @@ class Not(Node):
 class Logic(Node):
     """Logical connective between two formulas: `and`, `or`, `xor`, `->` or `<->`."""
 
+    is_formula: ClassVar = True
     op: Literal["and", "or", "xor", "->", "<->"]
     left: Expr
     right: Expr
@@ -293,22 +321,30 @@ class Declaration(Node):
     """Base class of the declarations in a specification.
 
     Attributes:
+        noun: kind of the declaration in messages.
         name: the declared name.
         name_span: location of the name in the source.
         tags: tags before the declaration.
         doc: text of the `##` comment before it.
     """
 
+    noun: ClassVar[str]
     name: str
     name_span: Span = field(compare=False, repr=False)
     tags: tuple[Tag, ...]
     doc: str
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names that the declaration introduces."""
+        return (self.name,)
 
 
 @dataclass(frozen=True, slots=True)
 class Signal(Declaration):
     """Declaration `env signal x : Type [unit] in [lo, hi] from "column"`; each declared name gets a node."""
 
+    noun: ClassVar = "signal"
     role: Literal["input", "output", "state", "env"] | None
     type: TypeRef | None
     unit: str
@@ -320,6 +356,7 @@ class Signal(Declaration):
 class Const(Declaration):
     """Declaration `const c [unit] = expr`."""
 
+    noun: ClassVar = "constant"
     type: TypeRef | None
     unit: str
     value: Expr
@@ -332,6 +369,7 @@ class Param(Declaration):
     `domain` is the pair of bounds, a set of values, or the call that names a distribution.
     """
 
+    noun: ClassVar = "parameter"
     type: TypeRef | None
     unit: str
     domain: tuple[Expr, Expr] | SetLiteral | Expr
@@ -341,13 +379,20 @@ class Param(Declaration):
 class Enum(Declaration):
     """Declaration `enum Sign { stop = 0, light = 1 }`."""
 
+    noun: ClassVar = "enum"
     members: tuple[tuple[str, int], ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The name of the enum and those of its members."""
+        return (self.name, *(name for name, _ in self.members))
 
 
 @dataclass(frozen=True, slots=True)
 class Region(Declaration):
     """Declaration `region pond = circle(…)`."""
 
+    noun: ClassVar = "region"
     value: Expr
 
 
@@ -363,6 +408,7 @@ class Formal(Node):
 class Def(Declaration):
     """Declaration `def name(args) = expr`, a macro."""
 
+    noun: ClassVar = "definition"
     formals: tuple[Formal, ...]
     type: TypeRef | None
     value: Expr
@@ -372,6 +418,7 @@ class Def(Declaration):
 class Extern(Declaration):
     """Declaration `extern fn ee(q: real[7]) -> real[3] [m]`."""
 
+    noun: ClassVar = "function"
     formals: tuple[Formal, ...]
     type: TypeRef
     unit: str
@@ -381,6 +428,7 @@ class Extern(Declaration):
 class Require(Declaration):
     """Declaration `require name: formula`."""
 
+    noun: ClassVar = "requirement"
     formula: Expr
 
 
@@ -388,6 +436,7 @@ class Require(Declaration):
 class Assume(Declaration):
     """Declaration `assume name: formula`."""
 
+    noun: ClassVar = "assumption"
     formula: Expr
 
 
@@ -398,33 +447,3 @@ class Import(Node):
     target: str
     is_file: bool
     alias: str | None
-
-
-Item: TypeAlias = Signal | Const | Param | Enum | Region | Def | Extern | Require | Assume
-
-
-@dataclass(frozen=True, slots=True)
-class Spec(Node):
-    """Syntax tree of a whole file.
-
-    Attributes:
-        name: name given by `spec NAME`; "" without it.
-        system: path given by `system "…"`, or None.
-        system_span: location of that path in the source, or None.
-        time_unit: unit of interval bounds that are written without a unit, given by the line `time UNIT`; ""
-            if there is no such line.
-        imports: imports, in order.
-        items: declarations, in order.
-        source: the source text.
-        library: key of an imported file (see `stlc.compile.frontend.modules`) -> its text. A trace, for
-            example, stores such texts. If None, the files are read from disk.
-    """
-
-    name: str
-    system: str | None
-    system_span: Span | None = field(compare=False, repr=False)
-    time_unit: str
-    imports: tuple[Import, ...]
-    items: tuple[Item, ...]
-    source: Source = field(compare=False, repr=False)
-    library: Mapping[str, str] | None = field(default=None, compare=False, repr=False)

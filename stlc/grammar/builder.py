@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar import ast
 from stlc.grammar.errors.units import unit_advice
-from stlc.grammar.words import BINARY_TEMPORAL, BUILT_IN, SPACE, UNARY_TEMPORAL
+from stlc.grammar.words import BUILT_IN, OPERATORS, SPACE
 from stlc.source import Source, Span
 from stlc.units import Unit
 
@@ -198,7 +198,7 @@ def _operator(token: TerminalToken, written: Sequence[ast.Interval]) -> tuple[st
     """
     match = _LETTERS.match(token.text)
     assert match is not None
-    op = (UNARY_TEMPORAL | BINARY_TEMPORAL)[match[0]]
+    op = OPERATORS[match[0]].name
     interval = written[0] if written else None
     if interval is not None and token.kind.endswith("_AT"):
         interval = replace(interval, clock="start")

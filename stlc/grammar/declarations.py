@@ -24,7 +24,7 @@ from stlc.grammar.builder import (
     several,
     unit_of,
 )
-from stlc.source import Source, Span
+from stlc.source import Span
 
 _SIZE_DIGITS = 4
 _DOC = re.compile(r"^[ \t]*##(?!#)[ \t]?(.*?)[^\S\n]*$", re.MULTILINE)
@@ -39,7 +39,7 @@ class Pragma:
     span: Span
 
 
-Item: TypeAlias = Pragma | ast.Import | ast.Item | tuple[ast.Item, ...]
+Item: TypeAlias = Pragma | ast.Import | ast.Declaration | tuple[ast.Declaration, ...]
 
 
 def _system_ref(_: BuildContext, __: Span, children: Sequence[Any]) -> Pragma:
@@ -95,14 +95,14 @@ def _heads(
     return [{**shared, "name": own_name(context, leaf), "name_span": leaf.span} for leaf in names]
 
 
-def _declaration(kind: Callable[..., ast.Item], *parts: str) -> BuildRule:
+def _declaration(kind: Callable[..., ast.Declaration], *parts: str) -> BuildRule:
     """Return a function that converts declarations with one name to nodes of class `kind`.
 
     The converted children of a declaration are its tags, its name, and one value for each field in `parts`,
     in order. The entry `sort` in `parts` stands for the two fields `type` and `unit`.
     """
 
-    def build(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Item:
+    def build(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Declaration:
         tags, leaf, *values = children
         (head,) = _heads(context, span, (leaf,), tags)
         own = dict(zip(parts, values, strict=True))
@@ -161,7 +161,7 @@ def _enum(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Enu
     return ast.Enum(**head, members=tuple(members))
 
 
-def _extern(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Item:
+def _extern(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Declaration:
     *before, unit = children
     build = _declaration(partial(ast.Extern, unit=unit_of(context, unit)), "formals", "type")
     extern: ast.Extern = build(context, span, before)
@@ -192,49 +192,3 @@ DECLARATIONS: Mapping[str, BuildRule] = MappingProxyType(
     }
 )
 """Rule of the grammar -> function that converts its parse-tree nodes."""
-
-# ---------------------------------------------------------------------- the whole
-
-
-def assemble(source: Source, items: Sequence[Item], findings: list[Diagnostic]) -> ast.Spec:
-    """Return the specification that consists of the pragmas, imports and declarations in `items`.
-
-    Pragmas are the lines about the whole file. E102 is appended to `findings` for a pragma that is repeated.
-    """
-    pragmas: dict[str, Pragma] = {}
-    imports: list[ast.Import] = []
-    declared: list[ast.Item] = []
-    for item in items:
-        match item:
-            case Pragma(kind, _, span):
-                if kind in pragmas:
-                    findings.append(_twice(pragmas[kind], span))
-                pragmas.setdefault(kind, item)
-            case ast.Import():
-                imports.append(item)
-            case tuple():
-                declared.extend(item)
-            case _:
-                declared.append(item)
-    system = pragmas.get("system")
-    return ast.Spec(
-        source.span(0, len(source.text)),
-        name=pragmas["spec"].value if "spec" in pragmas else "",
-        system=None if system is None else system.value,
-        system_span=None if system is None else system.span,
-        time_unit=pragmas["time"].value if "time" in pragmas else "",
-        imports=tuple(imports),
-        items=tuple(declared),
-        source=source,
-    )
-
-
-def _twice(first: Pragma, span: Span) -> Diagnostic:
-    return Diagnostic(
-        "E102",
-        f"`{first.kind}` is given twice",
-        span,
-        label="again",
-        labels=(first.span.label("first"),),
-        help=("keep one of them",),
-    )

@@ -9,7 +9,7 @@ from typing import Any
 
 from stlc.grammar import ast
 from stlc.grammar.printer import show_expr, show_set
-from stlc.grammar.traverse import descendants
+from stlc.grammar.spec import Spec
 from stlc.grammar.words import OPERATORS
 
 _EDGES = {"rise": "{} becomes true", "fall": "{} becomes false"}
@@ -34,7 +34,7 @@ REPEATED = 200_000
 class Meanings:
     """Descriptions in words of the definitions of a specification; each is computed once."""
 
-    def __init__(self, spec: ast.Spec) -> None:
+    def __init__(self, spec: Spec) -> None:
         self._known = {entry.name: entry for entry in spec.items if isinstance(entry, _NAMED)}
         self._words: dict[str, str] = {}
         self._uses: dict[str, list[str]] = {}
@@ -71,7 +71,7 @@ class Meanings:
         names: set[str] = set()
         queue = [expr]
         while queue:
-            for node in descendants(queue.pop()):
+            for node in queue.pop().walk():
                 if isinstance(node, ast.Attr):
                     return False
                 if isinstance(node, ast.Temporal | ast.Until) and not OPERATORS[node.op].past:
@@ -82,7 +82,7 @@ class Meanings:
         return True
 
     def _used(self, expr: ast.Expr) -> list[str]:
-        names = (node.name for node in descendants(expr) if isinstance(node, ast.Name))
+        names = (node.name for node in expr.walk() if isinstance(node, ast.Name))
         return list(dict.fromkeys(name for name in names if name in self._known))
 
 

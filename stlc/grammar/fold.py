@@ -16,7 +16,7 @@ from lark import Token, Tree
 from stlc.diagnostics import Diagnostic
 from stlc.grammar.builder import EXPRESSIONS, BuildContext, BuildRule, TerminalToken
 from stlc.grammar.declarations import DECLARATIONS
-from stlc.grammar.scan import lexemes
+from stlc.grammar.scan import Lexeme
 from stlc.source import Span
 
 MAX_DEPTH = 150
@@ -116,7 +116,7 @@ class _Chain:
         """
         start = self.start
         if low:
-            start = next(lexemes(context.source.text, self.operators[low - 1].span.end)).start
+            start = next(Lexeme.scan(context.source.text, self.operators[low - 1].span.end)).start
 
         def joined(left: _Built, right: _Built, middle: int, end: int) -> _Built:
             span = context.source.span(start, self.ends[end - 2])

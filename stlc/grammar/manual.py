@@ -11,6 +11,7 @@ from typing import ClassVar, Literal
 from stlc.diagnostics import usage
 from stlc.grammar import ast
 from stlc.grammar.english import Meanings
+from stlc.grammar.spec import Spec
 
 FOLDER = Path(__file__).parents[1] / "pages"
 _FENCE = re.compile(r"^```(?P<language>\w*)(?P<notes>[^\n]*)\n(?P<body>.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -58,14 +59,14 @@ class Page:
             for match in _FENCE.finditer(self.text)
         )
 
-
-def read_page(name: str) -> Page | None:
-    """Return the manual page `name` (an error code or `precedence`); None if there is no such page."""
-    path = FOLDER / f"{name}.md"
-    if not path.is_file():
-        return None
-    title, _, text = path.read_text(encoding="utf-8").partition("\n")
-    return Page(name, title.removeprefix("# "), text.strip("\n") + "\n")
+    @classmethod
+    def read(cls, name: str) -> Page | None:
+        """Return the manual page `name` (an error code or `precedence`); None if there is no such page."""
+        path = FOLDER / f"{name}.md"
+        if not path.is_file():
+            return None
+        title, _, text = path.read_text(encoding="utf-8").partition("\n")
+        return cls(name, title.removeprefix("# "), text.strip("\n") + "\n")
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,28 +88,28 @@ class SpecInWords:
     spec: str
     requirements: tuple[RequirementInWords, ...]
 
+    @classmethod
+    def of(cls, spec: Spec, name: str, wanted: Sequence[str] = ()) -> SpecInWords:
+        """Translate the requirements of a specification called `name`: those in `wanted`, all if it is empty.
 
-def in_words(spec: ast.Spec, name: str, wanted: Sequence[str] = ()) -> SpecInWords:
-    """Translate the requirements of a specification called `name`: those in `wanted`, or all if it is empty.
-
-    Raises UsageError (U101) if there is no such requirement.
-    """
-    items = [item for item in spec.items if isinstance(item, ast.Require | ast.Assume)]
-    for one in wanted:
-        if one not in [item.name for item in items]:
-            missing = usage(f"`{name}` has no requirement `{one}`")
-            raise missing.near(one, [item.name for item in items])
-    meanings = Meanings(spec)
-    found = [
-        RequirementInWords(
-            item.name,
-            "require" if isinstance(item, ast.Require) else "assume",
-            tuple(tag.name for tag in item.tags),
-            item.doc,
-            meanings.sentence(item),
-            dict(meanings.of(item)),
-        )
-        for item in items
-        if not wanted or item.name in wanted
-    ]
-    return SpecInWords(name, tuple(found))
+        Raises UsageError (U101) if there is no such requirement.
+        """
+        items = spec.rules
+        for one in wanted:
+            if one not in [item.name for item in items]:
+                missing = usage(f"`{name}` has no requirement `{one}`")
+                raise missing.near(one, [item.name for item in items])
+        meanings = Meanings(spec)
+        found = [
+            RequirementInWords(
+                item.name,
+                "require" if isinstance(item, ast.Require) else "assume",
+                tuple(tag.name for tag in item.tags),
+                item.doc,
+                meanings.sentence(item),
+                dict(meanings.of(item)),
+            )
+            for item in items
+            if not wanted or item.name in wanted
+        ]
+        return cls(name, tuple(found))

@@ -1,8 +1,4 @@
-"""Parser from text to syntax tree, based on Lark.
-
-A text is split before each declaration and the pieces are parsed separately, so that one run reports all
-independent errors.
-"""
+"""Parser of expressions and other pieces of a text, based on Lark: from text to syntax tree."""
 
 from __future__ import annotations
 
@@ -15,12 +11,11 @@ from lark import Tree, UnexpectedInput
 from stlc.diagnostics import SpecError
 from stlc.grammar import ast
 from stlc.grammar.builder import BuildContext
-from stlc.grammar.declarations import Item, assemble
 from stlc.grammar.errors.failure import Piece
 from stlc.grammar.errors.hints import diagnose
 from stlc.grammar.errors.unicode import unseen_characters
 from stlc.grammar.fold import PieceError, fold
-from stlc.grammar.scan import declaration_starts, lexemes
+from stlc.grammar.scan import Lexeme
 from stlc.grammar.tables import load_parser
 from stlc.source import Source
 
@@ -30,35 +25,6 @@ MAX_LEXEMES = 500_000
 """Words and signs of the longest text: linting it takes half a minute of the processor and some 200 MB."""
 _SHARED_TEXT = 32_768
 """Characters of the longest text whose trees are shared: they keep the text in memory."""
-
-
-def parse(source: Source) -> ast.Spec:
-    """Return the syntax tree of a specification.
-
-    Raises:
-        SpecError: the text has errors; of the independent ones, the first `MAX_ERRORS` are reported.
-    """
-    _check_text(source, 0, len(source.text))
-    context = BuildContext(source)
-    items: list[Item] = []
-    starts = declaration_starts(source.text)
-    skip_line = 0
-    for start, end in zip(starts, [*starts[1:], len(source.text)], strict=True):
-        if skip_line and source.position(start)[0] == skip_line:
-            continue
-        skip_line = 0
-        piece = Piece(source, start, end, "start")
-        try:
-            items.extend(_build(piece, context))
-        except PieceError as error:
-            context.findings.append(error.finding)
-            skip_line = source.position(max(start, end - 1))[0]
-        if len(context.findings) >= MAX_ERRORS:
-            break
-    spec = assemble(source, items, context.findings)
-    if context.findings:
-        raise SpecError(*context.findings[:MAX_ERRORS])
-    return spec
 
 
 def parse_expr(source: Source, start: int = 0, end: int | None = None) -> ast.Expr:
@@ -75,11 +41,11 @@ def parse_expr(source: Source, start: int = 0, end: int | None = None) -> ast.Ex
 
 
 def _parsed(source: Source, start: int, end: int) -> ast.Expr:
-    _check_text(source, start, end)
+    check_text(source, start, end)
     context = BuildContext(source)
     piece = Piece(source, start, end, "expr")
     try:
-        expr: ast.Expr = _build(piece, context)
+        expr: ast.Expr = build(piece, context)
     except PieceError as error:
         raise SpecError(*context.findings, error.finding) from None
     if context.findings:
@@ -90,11 +56,11 @@ def _parsed(source: Source, start: int, end: int) -> ast.Expr:
 _shared = lru_cache(maxsize=1024)(_parsed)
 
 
-def _check_text(source: Source, start: int, end: int) -> None:
+def check_text(source: Source, start: int, end: int) -> None:
     """Raise SpecError if the text from `start` to `end` is too long (E005) or has odd blanks (E001)."""
     if end - start > MAX_TEXT:
         raise _too_large(source, f"is larger than {MAX_TEXT // 1_000_000} million characters")
-    if any(islice(lexemes(source.text, start, end), MAX_LEXEMES, None)):
+    if any(islice(Lexeme.scan(source.text, start, end), MAX_LEXEMES, None)):
         raise _too_large(source, f"has more than {MAX_LEXEMES:,} words and signs")
     unseen = tuple(islice(unseen_characters(source, start, end), MAX_ERRORS))
     if unseen:
@@ -106,7 +72,8 @@ def _too_large(source: Source, what: str) -> SpecError:
     return SpecError.of("E005", f"`{source.name}` {what}", help=help_)
 
 
-def _build(piece: Piece, context: BuildContext) -> Any:
+def build(piece: Piece, context: BuildContext) -> Any:
+    """Return what a piece of a text stands for. Raises PieceError for an error of its syntax."""
     try:
         tree = load_parser().parse(piece.text, start=piece.rule)
     except UnexpectedInput as error:

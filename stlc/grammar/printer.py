@@ -14,6 +14,7 @@ from types import MappingProxyType
 from typing import Any
 
 from stlc.grammar import ast
+from stlc.grammar.spec import Spec
 from stlc.grammar.words import BUILT_IN, RESERVED
 
 _IDENTIFIER = re.compile(r"[^\W\d¹²³⁰⁴-⁹][^\W¹²³⁰⁴-⁹]*")
@@ -304,7 +305,7 @@ def _import_line(item: ast.Import) -> str:
     return f"import {target}" + (f" as {own_name(item.alias)}" if item.alias else "")
 
 
-def _spec(spec: ast.Spec) -> str:
+def _spec(spec: Spec) -> str:
     pragmas = [
         *([f"spec {show_name(spec.name)}"] if spec.name else []),
         *([f'system "{spec.system}"'] if spec.system is not None else []),
@@ -344,7 +345,7 @@ _DECLARED: Mapping[type, Callable[[Any], str]] = MappingProxyType(
 
 _PARTS: Mapping[type, Callable[[Any], str]] = MappingProxyType(
     {
-        ast.Spec: _spec,
+        Spec: _spec,
         ast.Import: _import_line,
         ast.Tag: _tag,
         ast.TypeRef: _type,

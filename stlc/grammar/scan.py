@@ -13,13 +13,12 @@ from types import MappingProxyType
 from typing import Literal
 
 from stlc.grammar.words import (
-    BINARY_TEMPORAL,
     DECLARATIONS,
+    OPERATORS,
     PRAGMAS,
     RESERVED,
     ROLES,
     SPACE,
-    UNARY_TEMPORAL,
 )
 from stlc.source import Source, Span
 
@@ -38,7 +37,6 @@ _LEXEME = re.compile(
 )
 _NO_PRAGMA = RESERVED | {"from", "as", *ROLES}
 CLOSES = MappingProxyType({"(": ")", "[": "]", "{": "}"})
-_TEMPORAL = UNARY_TEMPORAL.keys() | BINARY_TEMPORAL.keys()
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +47,17 @@ class Lexeme:
     text: str
     start: int
     end: int
+
+    @classmethod
+    def scan(cls, text: str, start: int = 0, end: int | None = None) -> Iterator[Lexeme]:
+        """Yield the lexemes (words, numbers, strings, signs) of a text from offset `start` to `end`.
+
+        Any text is accepted. Blanks and comments are left out.
+        """
+        for match in _LEXEME.finditer(text, start, len(text) if end is None else end):
+            kind = match.lastgroup
+            if kind is not None and kind != "comment":
+                yield cls(kind, match[0], match.start(), match.end())  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,17 +70,6 @@ class Bracket:
     opening: Lexeme
     interval: bool
     closing: Lexeme | None = None
-
-
-def lexemes(text: str, start: int = 0, end: int | None = None) -> Iterator[Lexeme]:
-    """Yield the lexemes (words, numbers, strings, signs) of a text from offset `start` to `end`.
-
-    Any text is accepted. Blanks and comments are left out.
-    """
-    for match in _LEXEME.finditer(text, start, len(text) if end is None else end):
-        kind = match.lastgroup
-        if kind is not None and kind != "comment":
-            yield Lexeme(kind, match[0], match.start(), match.end())  # type: ignore[arg-type]
 
 
 def comments(source: Source) -> Iterator[Span]:
@@ -90,7 +88,7 @@ def declaration_starts(text: str) -> list[int]:
     starts = [0]
     tag: int | None = None
     before: Lexeme | None = None
-    for lexeme in lexemes(text):
+    for lexeme in Lexeme.scan(text):
         if before is not None and _is_pragma(text, before, lexeme):
             starts.append(before.start)
         if before is not None and before.text == "@" and lexeme.kind in ("word", "quoted") and tag is None:
@@ -138,7 +136,7 @@ def brackets(items: Sequence[Lexeme]) -> list[Bracket]:
 
 def opens_interval(before: Lexeme) -> bool:
     """True if a bracket after the lexeme `before` may open the interval of a temporal operator."""
-    return before.text == "@" or (before.kind == "word" and before.text.rstrip("_") in _TEMPORAL)
+    return before.text == "@" or (before.kind == "word" and before.text.rstrip("_") in OPERATORS)
 
 
 def closes(bracket: Bracket, text: str) -> bool:

@@ -1,4 +1,4 @@
-"""Words of the language: temporal operators, reserved words, unit names, grammar patterns."""
+"""Words of the language: temporal operators, reserved words, grammar patterns."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ class TemporalOperator:
     Attributes:
         name: preferred spelling.
         meaning: one sentence about the operator, for the editor.
-        english: English phrase that contains the operands `{p}` and `{q}` and the window `{when}`; the
-            operator is binary if the phrase contains `{q}`.
+        english: English phrase that contains the operands `{p}` and `{q}` and the window `{when}`.
         aliases: other spellings.
         past: whether the window lies in the past.
         mirror: past operator that corresponds to this future operator, such as `once` to `eventually`; named
@@ -34,6 +33,11 @@ class TemporalOperator:
     past: bool = False
     mirror: str = ""
     expansion: str = ""
+
+    @property
+    def binary(self) -> bool:
+        """True for an operator with two operands, whose English phrase contains `{q}`."""
+        return "{q}" in self.english
 
 
 TEMPORAL = (
@@ -89,20 +93,8 @@ TEMPORAL = (
     ),
 )
 
-OPERATORS = MappingProxyType({operator.name: operator for operator in TEMPORAL})
-"""Name -> temporal operator."""
-
-
-def _spellings(*, binary: bool) -> MappingProxyType[str, str]:
-    found = (operator for operator in TEMPORAL if ("{q}" in operator.english) is binary)
-    return MappingProxyType({word: each.name for each in found for word in (each.name, *each.aliases)})
-
-
-UNARY_TEMPORAL = _spellings(binary=False)
-"""Spelling of a temporal operator with one operand -> its name."""
-
-BINARY_TEMPORAL = _spellings(binary=True)
-"""Spelling of a temporal operator with two operands -> its name."""
+OPERATORS = MappingProxyType({word: each for each in TEMPORAL for word in (each.name, *each.aliases)})
+"""Spelling -> temporal operator; one operator has several spellings."""
 
 DECLARATIONS = ("require", "assume", "def", "const", "param", "signal", "region", "enum", "extern", "import")
 ROLES = ("input", "output", "state", "env")
@@ -112,8 +104,7 @@ RESERVED = frozenset(
     {
         *("not", "and", "or", "xor", "iff", "implies", "in", "if", "then", "else", "true", "false", "inf"),
         *("forall", "exists", "freeze"),
-        *UNARY_TEMPORAL,
-        *BINARY_TEMPORAL,
+        *OPERATORS,
         *DECLARATIONS,
     }
 )
@@ -123,21 +114,6 @@ BUILT_IN = MappingProxyType(
     {"T": "the planning horizon", "end": "the last sample", "dt": "the time between two samples"}
 )
 """Built-in names; a user-defined name of this spelling needs backticks."""
-
-UNIT_NAMES = MappingProxyType(
-    {
-        **dict.fromkeys(("metre", "metres", "meter", "meters"), "m"),
-        **dict.fromkeys(("second", "seconds", "sec", "secs"), "s"),
-        **dict.fromkeys(("minute", "minutes", "mins"), "min"),
-        **dict.fromkeys(("hour", "hours", "hr", "hrs"), "h"),
-        **dict.fromkeys(("degree", "degrees"), "deg"),
-        **dict.fromkeys(("radian", "radians"), "rad"),
-        **dict.fromkeys(("kilogram", "kilograms", "kgs"), "kg"),
-        **dict.fromkeys(("kmh", "kph"), "km/h"),
-        **{"hertz": "Hz", "newton": "N", "volt": "V", "watt": "W", "percent": "%", "sample": "steps"},
-    }
-)
-"""Unit written out -> its symbol in the language."""
 
 SPACE = r"[ \t\r\n]"
 """Pattern of a blank. `stlc.grammar.errors.unicode` refuses every other blank, and CR outside of CRLF."""
@@ -161,8 +137,8 @@ PATTERNS = MappingProxyType(
     {
         "SPACE": SPACE,
         "BLANK": _BLANK,
-        "UNARY": _choice(UNARY_TEMPORAL),
-        "BINARY": _choice(BINARY_TEMPORAL),
+        "UNARY": _choice(word for word, each in OPERATORS.items() if not each.binary),
+        "BINARY": _choice(word for word, each in OPERATORS.items() if each.binary),
         "RESERVED": _choice(RESERVED),
         "AFTER_PERCENT": _choice(RESERVED - {"true", "false", "inf"}),
         "UNITS": _units(),

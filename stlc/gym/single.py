@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.controller.problem.environments import MOST, Environments, require_reward, reward_at_end
@@ -187,7 +186,7 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
             return state
         driven = torch.cat(self._driven[-self.task.horizon - 1 :]).numpy(force=True)
         columns = {name: driven[:, i, None] for i, name in enumerate(self.task.system.names)}
-        margins = evaluate(self._formulas, columns, ops=NUMPY, end="truncate")
+        margins = evaluate(self._formulas, columns, end="truncate")
         exact = [float(np.broadcast_to(margin, (1, 1))[0, 0]) for margin in margins]
         each = np.clip(np.nan_to_num(exact, nan=-MOST), -MOST, MOST)
         named = zip(self.task.rules, each, strict=True)

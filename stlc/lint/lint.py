@@ -13,9 +13,8 @@ from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import Purpose, compile_resolved
 from stlc.diagnostics import CODES, Diagnostic, Fix, SpecError, usage
-from stlc.grammar import ast
 from stlc.grammar.allow import not_allowed
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.lint.meaning import TYPED_RULES
 from stlc.lint.rules import RULES
 from stlc.source import Source, Span
@@ -149,7 +148,7 @@ def lint(
         selection: choice of the warnings to report.
     """
     try:
-        spec = parse(source)
+        spec = Spec.parse(source)
     except SpecError as error:
         return error.diagnostics
     plans = within is not None and within.purpose == "train"
@@ -168,7 +167,7 @@ def lint(
 
 
 def rule_findings(
-    spec: ast.Spec,
+    spec: Spec,
     selection: Selection = EVERYTHING_USUAL,
     *,
     resolved: typed.Spec | None = None,

@@ -10,15 +10,11 @@ from itertools import pairwise
 from types import MappingProxyType
 from typing import TypeAlias
 
-from stlc.compile.frontend.scope import enforced
-from stlc.compile.frontend.tags import nominal
 from stlc.compile.ir import typed
-from stlc.compile.ir.support import columns_in
-from stlc.compile.ir.traverse import mentions_horizon, nodes, operands
 from stlc.compile.ir.warnings import in_range, truth
 from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar import ast
-from stlc.grammar.traverse import descendants
+from stlc.grammar.spec import Spec
 from stlc.source import Span
 
 # ------------------------------------------------------------- the first sample only
@@ -40,19 +36,15 @@ class Extent(IntEnum):
 
 def extent(formula: typed.Formula) -> Extent:
     """Return the part of a recording that a formula reads when it is judged at the first sample."""
-    inner = max(map(extent, operands(formula)), default=Extent.NOTHING)
-    match formula:
-        case typed.Predicate():
-            return Extent.FIRST
-        case typed.Temporal(_, "always" | "eventually", window) | typed.Until(
-            _, "until" | "release" | "unless", window
-        ):
-            if window.hi is None:
-                return Extent.REST
-            now = typed.Time()
-            return max(inner, Extent.START if window.lo == window.hi == now else Extent.AHEAD)
-        case _:
-            return inner
+    inner = max(map(extent, formula.operands), default=Extent.NOTHING)
+    if isinstance(formula, typed.Predicate):
+        return Extent.FIRST
+    window = formula.ahead
+    if window is None:
+        return inner
+    if window.hi is None:
+        return Extent.REST
+    return max(inner, Extent.START if window.is_now else Extent.AHEAD)
 
 
 def judged_once(spec: typed.Spec) -> Iterator[Diagnostic]:
@@ -62,20 +54,21 @@ def judged_once(spec: typed.Spec) -> Iterator[Diagnostic]:
     beyond a bounded window. Requirements that mention `T` are judged at every sample.
     """
     for rule in spec.requirements:
-        if not mentions_horizon(rule.formula):
+        if not rule.formula.mentions_horizon:
             for part in _conjuncts(rule.formula):
                 first = _first_only(part)
                 if first is not None:
-                    yield _once(rule, part, first)
+                    name = f"`{rule.name}`" if first is rule.formula else f"a part of `{rule.name}`"
+                    yield _once(name, rule.written.span, part, first)
 
 
 def _conjuncts(formula: typed.Formula) -> Iterator[typed.Formula]:
-    match formula:
-        case typed.Logic(_, "and", items) if extent(formula) > Extent.FIRST:
-            for item in items:
-                yield from _conjuncts(item)
-        case _:
-            yield formula
+    items = formula.joined_by("and")
+    if items and extent(formula) > Extent.FIRST:
+        for item in items:
+            yield from _conjuncts(item)
+    else:
+        yield formula
 
 
 def _first_only(formula: typed.Formula) -> typed.Formula | None:
@@ -91,25 +84,24 @@ def _first_only(formula: typed.Formula) -> typed.Formula | None:
 
 def _outermost(formula: typed.Formula) -> Iterator[typed.Formula]:
     """Yield the operands of the connectives of a formula: predicates and temporal formulas."""
-    if isinstance(formula, typed.Not | typed.Logic | typed.Freeze):
+    if formula.pointwise:
         if extent(formula) is Extent.FIRST:
             yield formula
         else:
-            for part in operands(formula):
+            for part in formula.operands:
                 yield from _outermost(part)
     else:
         yield formula
 
 
-def _once(rule: typed.Requirement, part: typed.Formula, first: typed.Formula) -> Diagnostic:
-    place, whole = part.span, rule.written.span
+def _once(what: str, whole: Span, part: typed.Formula, first: typed.Formula) -> Diagnostic:
+    place = part.span
     if not _within(place, whole):
         place = whole
     text = " ".join(place.text.split())
     shown = f"({text})" if len(text) <= 40 and "#" not in text and "//" not in text else "(…)"
     source = place.source
     edits = ((source.span(place.start, place.start), "always ("), (source.span(place.end, place.end), ")"))
-    what = f"`{rule.name}`" if first is rule.formula else f"a part of `{rule.name}`"
     return Diagnostic(
         "W311",
         f"{what} is judged at the first sample only",
@@ -130,18 +122,18 @@ def beyond_ranges(spec: typed.Spec) -> Iterator[Diagnostic]:
     predicates may matter with other arguments.
     """
     general = [item.span for item in spec.source_ast.items if isinstance(item, ast.Def) and item.formals]
-    ranges, facts = nominal(spec.signature.columns), enforced(spec.signature.columns)
+    ranges, facts = spec.signature.nominal, spec.signature.enforced
     reported: set[Span] = set()
     for rule in spec.requirements:
-        for node in nodes(rule.formula):
-            if not isinstance(node, typed.Predicate) or node.span in reported:
+        for node in rule.formula.predicates():
+            if node.span in reported:
                 continue
             if node.span.source is not spec.source_ast.source or any(_within(node.span, d) for d in general):
                 continue
             decided = truth(node, ranges)
-            if decided is not None and columns_in(node.num) and truth(node, facts) is None:
+            if decided is not None and node.num.columns and truth(node, facts) is None:
                 reported.add(node.span)
-                names = sorted(columns_in(node.num) & ranges.keys())
+                names = sorted(node.num.columns & ranges.keys())
                 known = ", ".join(in_range(name, spec.signature, ranges) for name in names)
                 word = "true" if decided else "false"
                 yield Diagnostic(
@@ -183,17 +175,8 @@ def bare_numbers(spec: typed.Spec) -> Iterator[Diagnostic]:
 
     `angle < 30` is read in radians if `angle` is; it is likely that degrees are meant.
     """
-    units = {
-        node.span: node.written
-        for rule in spec.requirements
-        for node in nodes(rule.formula)
-        if isinstance(node, typed.Predicate)
-    }
-    plain = {
-        item.name: item.value
-        for item in spec.source_ast.items
-        if isinstance(item, ast.Const) and not item.unit
-    }
+    units = {node.span: node.written for rule in spec.requirements for node in rule.formula.predicates()}
+    plain = {item.name: item.value for item in spec.source_ast.constants if not item.unit}
     for compared in _compared(spec.source_ast):
         unit = units.get(compared.span)
         rival = None if unit is None else _RIVALS.get(unit.text)
@@ -204,7 +187,7 @@ def bare_numbers(spec: typed.Spec) -> Iterator[Diagnostic]:
             amount = None if value is None else _bare(value)
             if value is None or amount is None or amount < rival.least:
                 continue
-            if any(isinstance(node, ast.Quantity) and node.unit for node in descendants(other)):
+            if any(isinstance(node, ast.Quantity) and node.unit for node in other.walk()):
                 continue
             text = value.span.text
             yield Diagnostic(
@@ -225,8 +208,8 @@ class _Compared:
     right: ast.Expr
 
 
-def _compared(spec: ast.Spec) -> Iterator[_Compared]:
-    for node in descendants(spec):
+def _compared(spec: Spec) -> Iterator[_Compared]:
+    for node in spec.walk():
         if isinstance(node, ast.Compare):
             for left, right in pairwise(node.operands):
                 yield _Compared(node.span if len(node.ops) == 1 else left.span.to(right.span), left, right)

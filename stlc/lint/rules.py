@@ -14,9 +14,9 @@ from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar import ast
 from stlc.grammar.allow import misunderstood
 from stlc.grammar.ambiguity import Ambiguity, AmbiguityKind, ambiguities
-from stlc.grammar.scan import Lexeme, comments, lexemes
-from stlc.grammar.traverse import descendants
-from stlc.grammar.words import BINARY_TEMPORAL, UNARY_TEMPORAL
+from stlc.grammar.scan import Lexeme, comments
+from stlc.grammar.spec import Spec
+from stlc.grammar.words import OPERATORS
 from stlc.source import Span
 
 _WHY: dict[AmbiguityKind, str] = {
@@ -28,12 +28,12 @@ _WHY: dict[AmbiguityKind, str] = {
 }
 
 
-def missing_parentheses(spec: ast.Spec) -> Iterator[Diagnostic]:
+def missing_parentheses(spec: Spec) -> Iterator[Diagnostic]:
     """Yield W301 for expressions that other STL tools would parse differently for lack of parentheses."""
     return (_finding("W301", part) for part in ambiguities(spec))
 
 
-def unclear_implications(spec: ast.Spec) -> Iterator[Diagnostic]:
+def unclear_implications(spec: Spec) -> Iterator[Diagnostic]:
     """Yield W302 for `and` or `or` next to `->` without parentheses; most tools parse it as stlc does."""
     parts = ambiguities(spec, implications=True)
     return (_finding("W302", part) for part in parts if part.kind == "implication")
@@ -56,16 +56,16 @@ def _finding(code: str, part: Ambiguity) -> Diagnostic:
 
 _SIGNS = {"&&": "and", "&": "and", "||": "or", "|": "or", "!": "not", "=>": "->", "<=>": "<->"}
 _WORDS = {
-    **{word: name for word, name in {**UNARY_TEMPORAL, **BINARY_TEMPORAL}.items() if word != name},
+    **{word: each.name for word, each in OPERATORS.items() if word != each.name},
     **{"implies": "->", "iff": "<->"},
 }
 
 
-def foreign_spellings(spec: ast.Spec) -> Iterator[Diagnostic]:
+def foreign_spellings(spec: Spec) -> Iterator[Diagnostic]:
     """Yield W106 for operators spelled as in other tools, such as `G`, `ev`, `&&`, `=>`."""
     source = spec.source
     end = Lexeme("sign", "", len(source.text), len(source.text))
-    for item, following in pairwise([*lexemes(source.text), end]):
+    for item, following in pairwise([*Lexeme.scan(source.text), end]):
         name = _own(item, following)
         if name is None:
             continue
@@ -93,27 +93,16 @@ def _own(item: Lexeme, following: Lexeme) -> str | None:
         return None
     bare = item.text.removesuffix("_") if following.text == "[" else item.text
     name = _WORDS.get(bare)
-    return bare if name is None and bare != item.text and bare in UNARY_TEMPORAL | BINARY_TEMPORAL else name
+    return bare if name is None and bare != item.text and bare in OPERATORS else name
 
 
-_KINDS: dict[type[ast.Declaration], str] = {
-    ast.Const: "constant",
-    ast.Param: "parameter",
-    ast.Enum: "enum",
-    ast.Region: "region",
-    ast.Def: "definition",
-    ast.Extern: "function",
-}
-
-
-def unused_names(spec: ast.Spec) -> Iterator[Diagnostic]:
+def unused_names(spec: Spec) -> Iterator[Diagnostic]:
     """Yield W105 for declarations that are never used; signals are exempt, as the system may need them."""
     used = Counter(_uses(spec))
     for item in spec.items:
-        kind = _KINDS.get(type(item))
-        members = [name for name, _ in item.members] if isinstance(item, ast.Enum) else []
-        if kind is not None and not any(used[name] for name in (item.name, *members)):
-            yield _unused(f"the {kind} `{item.name}` is never used", item.name_span)
+        exempt = item.noun in ("signal", "requirement", "assumption")
+        if not exempt and not any(used[name] for name in item.names):
+            yield _unused(f"the {item.noun} `{item.name}` is never used", item.name_span)
         if isinstance(item, ast.Def):
             inner = set(_uses(item.value))
             for formal in item.formals:
@@ -131,16 +120,15 @@ def _unused(message: str, span: Span, where: str = "") -> Diagnostic:
 
 
 def _uses(root: ast.Node) -> Iterator[str]:
-    return (node.name for node in descendants(root) if isinstance(node, ast.Name | ast.TypeRef))
+    return (node.name for node in root.walk() if isinstance(node, ast.Name | ast.TypeRef))
 
 
-def nothing_required(spec: ast.Spec) -> Iterator[Diagnostic]:
+def nothing_required(spec: Spec) -> Iterator[Diagnostic]:
     """Yield W504 for a file that declares signals but no requirement.
 
     A file without signals is meant to be imported, so it is exempt.
     """
-    kinds = {type(item) for item in spec.items}
-    if ast.Require not in kinds and (ast.Signal in kinds or not kinds):
+    if not spec.requirements and (spec.signals or not spec.items):
         name = spec.name or spec.source.name
         message, advice = (
             f"`{name}` requires nothing",
@@ -152,7 +140,7 @@ def nothing_required(spec: ast.Spec) -> Iterator[Diagnostic]:
 _REQUIREMENT = re.compile(r"(?:#+|//+)\s*(?:@\w+(?:\([^)]*\))?\s*)*require\s+(?P<name>\w+)\s*:(?!\s*$)")
 
 
-def requirements_in_comments(spec: ast.Spec) -> Iterator[Diagnostic]:
+def requirements_in_comments(spec: Spec) -> Iterator[Diagnostic]:
     """Yield W315 for comments that read as a requirement, unless there is a requirement of this name."""
     names = {item.name for item in spec.items}
     for comment in comments(spec.source):
@@ -162,12 +150,12 @@ def requirements_in_comments(spec: ast.Spec) -> Iterator[Diagnostic]:
             yield Diagnostic("W315", message, comment, help=("remove the `#`, or the comment",))
 
 
-def unread_comments(spec: ast.Spec) -> Iterator[Diagnostic]:
+def unread_comments(spec: Spec) -> Iterator[Diagnostic]:
     """Yield W319 for comments such as `# stlc: alow W311`, and for codes in them that are no warnings."""
     return misunderstood(spec.source)
 
 
-Check: TypeAlias = Callable[[ast.Spec], Iterator[Diagnostic]]
+Check: TypeAlias = Callable[[Spec], Iterator[Diagnostic]]
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,11 +24,8 @@ from numpy.typing import NDArray
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.interval import Intervals
 from stlc.compile.backends.array.interval_ops import INTERVALS
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.holes import holes_in, without_holes
-from stlc.compile.ir.support import columns_in
-from stlc.compile.ir.traverse import leaves, map_children, nodes
 from stlc.compile.namespace import Array
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -114,7 +111,7 @@ class Cells:
             case ir.AtStart(body=body):
                 return replace(formula, body=of(body, "point" if not loose else safe))
             case _:
-                return map_children(formula, formulas=lambda part: of(part, safe))
+                return formula.map_children(formulas=lambda part: of(part, safe))
 
     def _windowed(self, formula: ir.Temporal | ir.PastTemporal, over: Over, *, lower: bool) -> ir.Formula:
         """Bound on an operator with a window; see the text of the module.
@@ -129,7 +126,7 @@ class Cells:
             if last is not None and last < first:
                 return None
             body = self._bound(formula.body, over, lower=lower, loose=False)
-            return replace(formula, window=ir.Window(first, last), body=body)
+            return replace(formula.with_window(first, last), body=body)
 
         inner = None if hi is None else hi - 1
         edge: Over = "point" if over == "point" else _DUAL[whole]
@@ -168,15 +165,13 @@ class Cells:
 
     def _margins(self, atom: ir.Predicate) -> tuple[Floats, Floats]:
         """Bounds on the margin of a predicate, at each moment, or in each cell if it reads other instants."""
-        read = list(leaves(atom.num))
-        names = sorted({leaf.name for leaf in read if isinstance(leaf, ir.Signal)})
-        plain = all(isinstance(leaf, (ir.Signal, ir.Const)) for leaf in read)
-        if not plain or not self.before.keys() >= set(names):
+        names = sorted({name for name, *_ in atom.reads()})
+        if atom.shifted or atom.frozen or not self.before.keys() >= set(names):
             hulls = self.hulls(edges=True)
             (found,) = evaluate([atom], hulls, ops=INTERVALS, count=len(self.starts), end="truncate")
             return _unknown_at(-np.inf, found.low), _unknown_at(np.inf, found.high)
         if not names:
-            (value,) = evaluate([atom], {"": np.zeros((1, 1))}, ops=NUMPY)
+            (value,) = evaluate([atom], {"": np.zeros((1, 1))})
             batch = next(iter(self.before.values())).shape[1]
             constant = np.broadcast_to(value, (len(self.starts), batch))
             return constant, constant
@@ -186,7 +181,7 @@ class Cells:
         for later in product((False, True), repeat=len(clocks)):
             taken = {clock for clock, late in zip(clocks, later, strict=True) if late}
             env = {name: (self.after if self.clocks[name] in taken else self.before)[name] for name in names}
-            (margin,) = evaluate([atom], env, ops=NUMPY, count=len(self.times))
+            (margin,) = evaluate([atom], env, count=len(self.times))
             low = np.minimum(low, _unknown_at(-np.inf, margin))
             high = np.maximum(high, _unknown_at(np.inf, margin))
         return low, high
@@ -225,14 +220,14 @@ class Cells:
         flat, moments = _without_time(formula), len(self.times)
         names: dict[ir.Formula, str] = {}
         values: dict[str, Array] = {}
-        for atom in nodes(flat):
+        for atom in flat.walk():
             if isinstance(atom, ir.Predicate) and atom not in names:
                 names[atom] = f"{len(names)}"
                 high = self._margins(atom)[1]
                 values[names[atom]] = high if len(high) == moments else np.zeros((moments, high.shape[1]))
         worth = np.zeros((moments, 1))
         if values:
-            (worth,) = evaluate([over_columns(flat, names)], values, ops=NUMPY, count=moments)
+            (worth,) = evaluate([over_columns(flat, names)], values, count=moments)
         worth = worth.min(axis=1)
         cells = pairwise([*self.starts.tolist(), moments])
         chosen = np.array([first + int(np.argmin(worth[first:stop])) for first, stop in cells])
@@ -263,8 +258,8 @@ def _beyond_ends(extreme: Floats, point: Floats, *, least: bool) -> Floats:
 def _compared(items: Sequence[ir.Formula]) -> list[ir.Formula]:
     """Operands that compare instants, and predicates on the same signals, as in `rise(p)`; [] without any."""
     shifts = [item for item in items if isinstance(item, ir.Shift)]
-    read = frozenset().union(*(columns_in(shift) for shift in shifts))
-    same = [item for item in items if isinstance(item, ir.Predicate) and columns_in(item) <= read]
+    read = frozenset().union(*(shift.columns for shift in shifts))
+    same = [item for item in items if isinstance(item, ir.Predicate) and item.columns <= read]
     return [*shifts, *same] if shifts else []
 
 
@@ -277,11 +272,11 @@ def _without_time(formula: ir.Formula) -> ir.Formula:
             sides = (_without_time(left), _without_time(right))
             return ir.BoolOp("and" if op in ("until", "since") else "or", sides)
         case _:
-            return map_children(formula, formulas=_without_time)
+            return formula.map_children(formulas=_without_time)
 
 
 def over_columns(formula: ir.Formula, names: Mapping[ir.Formula, str]) -> ir.Formula:
     """Return the formula over the columns `names` of the values of its predicates and `freeze` formulas."""
     if isinstance(formula, (ir.Predicate, ir.Freeze)):
         return ir.Predicate(ir.Signal(names[formula]))
-    return map_children(formula, formulas=lambda part: over_columns(part, names))
+    return formula.map_children(formulas=lambda part: over_columns(part, names))

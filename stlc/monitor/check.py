@@ -16,7 +16,7 @@ from stlc.files import File
 from stlc.source import Source
 
 if TYPE_CHECKING:
-    from stlc.grammar import ast
+    from stlc.grammar.spec import Spec
     from stlc.monitor.instants import At
     from stlc.monitor.judgement import Verdict
     from stlc.monitor.online.online import Decision, Online
@@ -91,7 +91,7 @@ OF_TABLES = {"names", "resample", "dt", "max_gap", "between", "clock", "group", 
 
 
 def check(
-    spec: ast.Spec | str | Path | None,
+    spec: Spec | str | Path | None,
     trace: Subject,
     *,
     chunk: int = 0,
@@ -110,7 +110,7 @@ def check(
         TraceError: the trace cannot be read, or does not fit the specification.
         UsageError: U101, an option does not fit; U102, there is no such file.
     """
-    from stlc.grammar import ast
+    from stlc.grammar.spec import Spec
     from stlc.monitor.given import is_frame, trace_of_table
     from stlc.monitor.verdict import Monitor
     from stlc.trace import Trace
@@ -119,7 +119,7 @@ def check(
         odd = str(trace).endswith(".stl")
     else:
         odd = spec is None or not (isinstance(trace, Mapping | Trace) or is_frame(trace))
-    if odd or not isinstance(spec, ast.Spec | str | Path | None):
+    if odd or not isinstance(spec, Spec | str | Path | None):
         advice = "stlc.check(spec, trace), with a path, a data frame, a `Trace` or arrays by name"
         raise usage("a specification comes first, then the recording", advice)
     question = Question(**options)
@@ -388,10 +388,10 @@ def _monitor(
     system: str | None,
     overrides: tuple[tuple[str, str], ...],
 ) -> Monitor:
-    from stlc.grammar.parser import parse
+    from stlc.grammar.spec import Spec
     from stlc.monitor.verdict import Monitor
 
-    parsed = replace(parse(source), library=None if library is None else dict(library))
+    parsed = replace(Spec.parse(source), library=None if library is None else dict(library))
     return Monitor(parsed, system=system, overrides=dict(overrides))
 
 

@@ -9,13 +9,11 @@ from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from stlc.compile.frontend.interface import Interface
-from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
-from stlc.compile.ir.traverse import nodes
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import TraceError, UsageError, usage
 from stlc.files import File
-from stlc.grammar import ast
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 from stlc.trace import Trace, as_fraction
 from stlc.trace.time_grid import LONGEST
@@ -76,7 +74,7 @@ def given_times(dt: float | Fraction | None, horizon: float | Fraction | None) -
     return Times(None if dt is None else as_fraction(dt), None if horizon is None else as_fraction(horizon))
 
 
-def _declared(name: str | Source, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[Times, SystemDecl]:
+def _declared(name: str | Source, spec: Spec, overrides: Mapping[str, str]) -> tuple[Times, SystemDecl]:
     from stlc.dynamics.load import load_system_decl
 
     found = name if isinstance(name, Source) else File(name).system(spec.source.name)
@@ -84,7 +82,7 @@ def _declared(name: str | Source, spec: ast.Spec, overrides: Mapping[str, str]) 
     return Times(decl.dt, decl.dt * decl.horizon), decl
 
 
-def system_of(name: str | Source, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[Times, Interface]:
+def system_of(name: str | Source, spec: Spec, overrides: Mapping[str, str]) -> tuple[Times, Interface]:
     """Return what the system file `name` declares: time step and horizon, and signals and functions.
 
     The file is searched for beside the specification. `overrides`: name of a constant -> its value, as text.
@@ -99,7 +97,7 @@ def system_of(name: str | Source, spec: ast.Spec, overrides: Mapping[str, str]) 
     return times, replace(decl.interface(), functions=load_functions(decl))
 
 
-def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:
+def named_times(spec: Spec, overrides: Mapping[str, str]) -> Times | None:
     """Time step and horizon of the system that a specification names; None without one or without its file.
 
     None also for a specification that was stored with a run or a trace, and is not beside its files.
@@ -123,8 +121,8 @@ def require_windows(trace: Trace, rules: Sequence[CompiledRequirement]) -> None:
             windows hold so few, that the clock hardly counts seconds.
     """
     for rule in rules:
-        for node in nodes(rule.typed.formula):
-            if not isinstance(node, (typed.Temporal, typed.Until)) or node.interval.hi is None:
+        for node in rule.typed.formula.temporals():
+            if node.interval.hi is None:
                 continue
             last, length = node.interval.hi, float(node.interval.hi.seconds)
             if last.steps or last.horizons or not 0.0 < length < trace.dt * (1.0 - _SLACK):
@@ -166,12 +164,7 @@ def _require_seconds(trace: Trace, rules: Sequence[CompiledRequirement]) -> None
     usual = step < _LONG or any(step % unit == 0.0 and step <= most for unit, most in spans)
     if usual or not trace.clocks or any(clock.unit for clock in trace.clocks):
         return
-    intervals = (
-        node.interval
-        for rule in rules
-        for node in nodes(rule.typed.formula)
-        if isinstance(node, (typed.Temporal, typed.Until))
-    )
+    intervals = (node.interval for rule in rules for node in rule.typed.formula.temporals())
     bounds = [each.hi for each in intervals if each.hi is not None and not each.hi.horizons]
     longest = max(bounds, key=lambda each: each.seconds, default=None)
     if longest is None or not 0.0 < float(longest.seconds) < _WIDE * step:

@@ -21,7 +21,6 @@ from stlc.compile.backends.schedule import Boundary
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined_at
 from stlc.compile.ir.discretize import Grid
-from stlc.compile.ir.support import earliest
 from stlc.compile.namespace import Array
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import Diagnostic, usage
@@ -110,7 +109,7 @@ def beyond(rule: CompiledRequirement, starts: range, samples: int, horizon: int 
     `horizon` is the length of a planning window in steps; a trace that holds the whole planning window of an
     instant is not too short there.
     """
-    later, clocked = earliest(rule.formula)
+    later, clocked = rule.formula.earliest
     window = window_of(rule, horizon)
     least = later if window is None else min(later, window)
     first = samples - least if later else samples

@@ -11,7 +11,7 @@ from typing import ClassVar
 
 from stlc.diagnostics import Diagnostic, SpecError, SystemFileError, UsageError, usage
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.lint.lint import Selection, Surroundings
 from stlc.lint.lint import fix as repair
 from stlc.lint.lint import lint as lint_text
@@ -109,7 +109,7 @@ def lint(
         if trace is not None and not any(finding.severity == "error" for finding in found):
             from stlc.monitor.facts.findings import findings_on
 
-            tested = findings_on(parse(source), Path(trace), system)
+            tested = findings_on(Spec.parse(source), Path(trace), system)
             findings += [each for each in tested if selection.wants(each.code)]
     return Lint(names, tuple(findings), repairs)
 
@@ -121,7 +121,7 @@ def _surroundings(system: str | None, source: Source) -> Surroundings | None:
     """
     if system is None:
         try:
-            system = parse(source).system
+            system = Spec.parse(source).system
         except SpecError:
             return None
     if system is None:

@@ -20,8 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import Reach, farthest
-from stlc.compile.ir.traverse import children, map_children, nodes
 
 FAR = 1 << 40
 """More samples than any trace has."""
@@ -44,7 +42,7 @@ def prefix_bound(formula: ir.Formula, end: Literal["lower", "upper"], *, cut: bo
     least = end == "lower"
 
     def bound(node: ir.Formula) -> ir.Formula:
-        found = map_children(node, formulas=bound)
+        found = node.map_children(formulas=bound)
         if isinstance(found, (ir.Temporal, ir.Until)):
             clipped = cut or found.window.hi is None
             if (found.op in ("eventually", "until")) is not least:  # an early end is not the worst case
@@ -70,30 +68,16 @@ def with_seen(signals: Mapping[str, NDArray[np.float64]]) -> Mapping[str, NDArra
     return {**signals, SEEN: np.broadcast_to(1.0, next(iter(signals.values())).shape)}
 
 
-def own_span(node: ir.Formula) -> Reach:
-    """Return how many samples `node`, an operator or predicate, reads back and ahead.
-
-    What its operands read is not included. An unbounded window `[a, inf)` counts as `a` samples.
-    """
-    reads = [Reach(0, 0), *(farthest(num) for num in children(node) if not isinstance(num, ir.Formula))]
-    past, future = (max(ends) for ends in zip(*reads, strict=True))
-    steps = node.steps if isinstance(node, ir.Shift) else 0
-    if isinstance(node, ir.Windowed):
-        width = node.window.lo if node.window.hi is None else node.window.hi
-        steps = -width if node.back else width
-    return Reach(past + max(-steps, 0), future + max(steps, 0))
-
-
 def lengthened(formula: ir.Formula, samples: int) -> ir.Formula:
     """Return the formula with every unbounded future window replaced by a long bounded one.
 
     The new windows are so long that no value after their end depends on the `samples` known samples.
     """
-    length = samples + sum(sum(own_span(node)) for node in nodes(formula)) + 1
+    length = samples + sum(sum(node.own_reach) for node in formula.walk()) + 1
 
     def longer(node: ir.Formula) -> ir.Formula:
-        if isinstance(node, ir.Windowed) and not node.back and node.window.hi is None:
-            node = replace(node, window=ir.Window(node.window.lo, node.window.lo + length))
-        return map_children(node, formulas=longer)
+        if operator := node.unbounded:
+            node = operator.with_window(operator.window.lo, operator.window.lo + length)
+        return node.map_children(formulas=longer)
 
     return longer(formula)

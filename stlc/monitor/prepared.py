@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.ir.support import columns_in
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.compile.semantics.semantics import Semantics
 from stlc.diagnostics import TraceError
@@ -115,7 +114,7 @@ class Prepared:
         whole = found = self.whole
         if whole is None or found is None or rule.absolute:
             return None
-        spans = {name: span for name, span in self.signals.spans.items() if name in columns_in(rule.formula)}
+        spans = {name: span for name, span in self.signals.spans.items() if name in rule.formula.columns}
         for span in spans.values():
             found = found.within(span)
         if found.last < found.first:

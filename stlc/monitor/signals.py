@@ -19,14 +19,12 @@ from numpy.typing import NDArray
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.frontend.tags import BETWEEN, age_of
-from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import columns_in
-from stlc.compile.ir.traverse import numbers, subexpressions
 from stlc.compile.namespace import Array, Ops
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.escape import shell, visible
 from stlc.grammar import ast
+from stlc.grammar.spec import Spec
 from stlc.monitor.cells import Cells
 from stlc.monitor.given import CLOCKS, UNNAMED, Given
 from stlc.signature import Column, Kind
@@ -69,8 +67,8 @@ def needs_of(compiled: Compiled, rules: Sequence[CompiledRequirement]) -> tuple[
     Raises UsageError (E107) if the requirements call functions that are not loaded.
     """
     _require_functions(compiled, rules)
-    read = [(rule.name, columns_in(rule.formula)) for rule in rules]
-    items = (item for item in compiled.spec.items if isinstance(item, (ast.Signal, ast.Param)))
+    read = [(rule.name, rule.formula.columns) for rule in rules]
+    items = compiled.spec.read
     spans = {item.name: item.name_span for item in items}
     parameters = {each.column.name for each in compiled.typed.parameters}
     found = []
@@ -82,18 +80,17 @@ def needs_of(compiled: Compiled, rules: Sequence[CompiledRequirement]) -> tuple[
 
 
 def _require_functions(compiled: Compiled, rules: Sequence[CompiledRequirement]) -> None:
-    parts = (part for rule in rules for num in numbers(rule.formula) for part in subexpressions(num))
-    calls = (part for part in parts if isinstance(part, ir.Extern))
+    calls = (call for rule in rules for call in rule.formula.calls())
     missing = dict.fromkeys(call.name for call in calls if call.function is None)
     if not missing:
         return
-    places = {item.name: item.name_span for item in compiled.spec.items if isinstance(item, ast.Extern)}
+    places = {item.name: item.name_span for item in compiled.spec.functions}
     help_ = ("--system FILE names the system that does; its functions are Python code, and loading runs it",)
     message = "`{}` is a function from outside, and nobody provides it here"
     raise UsageError(*(Diagnostic("E107", message.format(n), places.get(n), help=help_) for n in missing))
 
 
-def reading_of(spec: ast.Spec, requested: Reading = AS_IT_IS, read: Collection[str] | None = None) -> Reading:
+def reading_of(spec: Spec, requested: Reading = AS_IT_IS, read: Collection[str] | None = None) -> Reading:
     """Return the options `requested`, completed by what the specification declares of its signals.
 
     Args:
@@ -104,7 +101,7 @@ def reading_of(spec: ast.Spec, requested: Reading = AS_IT_IS, read: Collection[s
 
     Raises UsageError (U101) if a name is that of no signal.
     """
-    signals = [item for item in spec.items if isinstance(item, ast.Signal)]
+    signals = spec.signals
     columns = {item.name: item.column for item in signals if item.column}
 
     def column(name: str) -> str:
@@ -113,7 +110,7 @@ def reading_of(spec: ast.Spec, requested: Reading = AS_IT_IS, read: Collection[s
         return columns.get(name) or f"{columns.get(base, base)}{bracket}{index}"
 
     worth: dict[str, Words] = {"bool": Column.TRUTH}
-    worth |= {item.name: dict(item.members) for item in spec.items if isinstance(item, ast.Enum)}
+    worth |= {item.name: dict(item.members) for item in spec.enums}
     kinds: dict[str, Kind] = {}
     words: dict[str, Words] = {}
     between: dict[str, Between] = {}
@@ -136,9 +133,9 @@ def reading_of(spec: ast.Spec, requested: Reading = AS_IT_IS, read: Collection[s
     return replace(requested, names=names, kinds=kinds, words=words, between=between, read=timely)
 
 
-def _require_signals(requested: Reading, spec: ast.Spec, columns: Mapping[str, str]) -> None:
+def _require_signals(requested: Reading, spec: Spec, columns: Mapping[str, str]) -> None:
     """Raise UsageError (U101) if an option names a signal that the specification does not declare."""
-    declared = [item.name for item in spec.items if isinstance(item, (ast.Signal, ast.Param))]
+    declared = [item.name for item in spec.read]
     known = {*declared, *columns.values(), CLOCK, *GROUPS}
     findings = []
     for option, names in (("--map", requested.names), ("--between", requested.between)):

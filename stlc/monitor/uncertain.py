@@ -16,12 +16,10 @@ import numpy as np
 
 from stlc.compile.backends.array.interval import EPSILON, Floats, Intervals, magnitudes, mul, widened
 from stlc.compile.backends.array.interval_ops import INTERVALS
-from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import numbers, subexpressions
 from stlc.compile.namespace import Array
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.diagnostics import Diagnostic, UsageError
-from stlc.grammar import ast
+from stlc.grammar.spec import Spec
 from stlc.jsontext import Num
 from stlc.monitor.values import Record
 from stlc.signature import Column
@@ -122,7 +120,7 @@ def _around(centre: Intervals, known: Uncertainty, column: Column) -> Intervals:
 
 
 def _misfit(
-    name: str, uncertain: Uncertainty, columns: Mapping[str, Column], spec: ast.Spec
+    name: str, uncertain: Uncertainty, columns: Mapping[str, Column], spec: Spec
 ) -> Diagnostic | None:
     """Return the reason for which a signal cannot have this uncertainty; None if it can."""
     vectors = {_INDEX.sub("", key): column for key, column in columns.items()}
@@ -131,7 +129,7 @@ def _misfit(
         note = (f"signals: {', '.join(columns)}",)
         missing = Diagnostic("U101", f"`--uncertain {name}=…`: no signal `{name}`", note=note)
         return missing.near(name, {**columns, **vectors})
-    signals = (item for item in spec.items if isinstance(item, (ast.Signal, ast.Param)))
+    signals = spec.read
     span = next((item.name_span for item in signals if item.name == _INDEX.sub("", name)), None)
     label = "declared here" if span else ""
     if known.kind in ("bool", "enum"):
@@ -149,9 +147,7 @@ def _opaque(rules: Sequence[CompiledRequirement]) -> list[Diagnostic]:
     """Return a finding for each requirement that calls a Python function."""
     findings = []
     for rule in rules:
-        parts = (part for num in numbers(rule.formula) for part in subexpressions(num))
-        calls = (part for part in parts if isinstance(part, ir.Extern))
-        for name in dict.fromkeys(call.name for call in calls if not isinstance(call.function, ir.Body)):
+        for name in dict.fromkeys(call.name for call in rule.formula.calls() if call.opaque):
             message = f"`--uncertain`: `{name}` is a Python function, whose values have no bounds"
             help_ = ("judge the other requirements: --require NAME",)
             findings.append(Diagnostic("U101", message, rule.span, label="calls it", help=help_))

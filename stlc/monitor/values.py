@@ -16,8 +16,6 @@ from stlc.compile.backends.schedule import Boundary
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined_at
 from stlc.compile.ir.holes import holes_in, partial, unsure, without_holes
-from stlc.compile.ir.support import columns_in, history
-from stlc.compile.ir.traverse import map_children, nodes, subexpressions
 from stlc.compile.namespace import Array, Ops
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.semantics import Exact, Semantics
@@ -56,7 +54,7 @@ class Record:
     @staticmethod
     def of(
         env: Mapping[str, Array],
-        ops: Ops,
+        ops: Ops = NUMPY,
         cells: Cells | None = None,
         semantics: Semantics | None = None,
     ) -> Record:
@@ -76,7 +74,7 @@ class Record:
             return self
         if not self.semantics.exact:
             return replace(self, cells=None)
-        if any(isinstance(node, ir.Freeze) for node in nodes(formula)):
+        if any(isinstance(node, ir.Freeze) for node in formula.walk()):
             env, holes = self.cells.interval_env()
             return Record(env, INTERVALS, self.semantics, holes)
         ready = replace(self, env=dict(self.env), loose=loose)
@@ -164,7 +162,7 @@ def window_bounds(
     from the first sample that past operators read to `end`. If the trace is too short for an excerpt, the
     missing samples are unknown; if `ends` is "truncate", the excerpt stops at the last sample instead.
     """
-    back = history(formula)
+    back = formula.history
     early = range(starts.start, max(min(back, starts.stop), starts.start))
     excerpts = [(record.cut(k + window + 1), k, 1) for k in early]
     later = _unrolled(record, range(early.stop, starts.stop), back, window)
@@ -211,12 +209,12 @@ def assume_missing_true(formula: ir.Formula, names: Collection[str]) -> ir.Formu
             inner = assume_missing_true(body, {*names, *(name for name, _ in known)})
             return replace(formula, bindings=known, body=inner) if known else inner
         case _:
-            return map_children(formula, formulas=lambda part: assume_missing_true(part, names))
+            return formula.map_children(formulas=lambda part: assume_missing_true(part, names))
 
 
 def _read(num: ir.Num) -> set[str]:
     """Names of the signals that an expression reads, and of the values stored by `freeze` that it reads."""
-    return {*columns_in(num), *(part.name for part in subexpressions(num) if isinstance(part, ir.FrozenVar))}
+    return {*num.columns, *num.frozen}
 
 
 def decisive(rule: CompiledRequirement, tolerance: float, signature: Signature) -> CompiledRequirement:
@@ -246,4 +244,4 @@ def by_truth(formula: ir.Formula, signals: Collection[str] | None = None) -> ir.
     if isinstance(formula, ir.Predicate):
         exact = signals is None or _read(formula.num) <= set(signals)
         return replace(formula, guard=True) if exact else formula
-    return map_children(formula, formulas=lambda part: by_truth(part, signals))
+    return formula.map_children(formulas=lambda part: by_truth(part, signals))

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
@@ -16,19 +15,16 @@ import numpy as np
 from stlc.compile.backends.array.graph import SignalPlan, signal_plan
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.schedule import Boundary
-from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.discretize import Grid, lacks
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.holes import partial
-from stlc.compile.ir.support import Reach, columns_in, farthest, history
-from stlc.compile.ir.traverse import leaves, numbers
+from stlc.compile.ir.support import Reach
 from stlc.compile.namespace import Array
 from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_resolved, resolve_for
 from stlc.compile.semantics.semantics import Exact, Semantics, semantics_of
 from stlc.compile.semantics.tolerance import TOLERANCE, End
 from stlc.diagnostics import SpecError, TraceError, usage
 from stlc.files import File
-from stlc.grammar import ast
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.monitor.explain.report import cause_of
 from stlc.monitor.facts.rules import facts_of
 from stlc.monitor.given import UNNAMED, Given, is_frame, trace_of_table
@@ -86,7 +82,7 @@ class Monitor:
 
     def __init__(
         self,
-        spec: ast.Spec | str | Path,
+        spec: Spec | str | Path,
         dt: Seconds | None = None,
         horizon: Seconds | None = None,
         system: str | Path | Source | None = None,
@@ -95,8 +91,8 @@ class Monitor:
         if isinstance(spec, Path) or (
             isinstance(spec, str) and spec.endswith(_SUFFIXES) and "\n" not in spec
         ):
-            spec = parse(File(spec).read())
-        self.spec = parse(Source("<text>", spec)) if isinstance(spec, str) else spec
+            spec = Spec.parse(File(spec).read())
+        self.spec = Spec.parse(Source("<text>", spec)) if isinstance(spec, str) else spec
         self._given = given_times(dt, horizon)
         self._overrides = dict(overrides or {})
         self._system, self._interface = Times(), None
@@ -114,13 +110,13 @@ class Monitor:
     @property
     def requirements(self) -> tuple[str, ...]:
         """Names of the requirements, in order."""
-        return tuple(item.name for item in self.spec.items if isinstance(item, ast.Require))
+        return tuple(self.spec.requirements)
 
     def reads(self, require: Sequence[str] = ()) -> frozenset[str]:
         """Signals that assumptions and the named requirements (empty: all) read; components as `q[0]`."""
         rules = chosen(self.resolved.requirements, require)
         formulas = (each.formula for each in (*rules, *self.resolved.assumptions))
-        return frozenset[str]().union(*map(columns_in, chain.from_iterable(map(numbers, formulas))))
+        return frozenset[str]().union(*(each.columns for each in formulas))
 
     @property
     def compiled(self) -> Compiled:
@@ -332,7 +328,7 @@ class Monitor:
     def _lacks(self, times: Times) -> bool:
         """True if the specification needs a time step or horizon that is unknown in `times`."""
         grid, spec = times.grid(), self.resolved
-        return any(lacks(grid, each.formula) for each in (*spec.requirements, *spec.assumptions))
+        return any(grid.lacks(each.formula) for each in (*spec.requirements, *spec.assumptions))
 
     def _compile(self, times: Times) -> Compiled:
         grid = times.grid()
@@ -405,10 +401,10 @@ def _selection(compiled: Compiled, names: Sequence[str], plain: bool) -> _Select
     past, future = 0, 0
     for rule in rules:
         formula = rule.formula
-        counted = any(leaf == ir.Signal(ir.ELAPSED) for leaf in leaves(formula))
-        past = max(past, FAR if rule.absolute or counted else history(formula))
+        counted = formula.counts
+        past = max(past, FAR if rule.absolute or counted else formula.history)
         lasting = rule.uses_end and window_of(rule, horizon) is None
-        later = max((farthest(num).future for num in numbers(formula)), default=0) + (horizon or 0)
+        later = max((num.farthest.future for num in formula.numbers()), default=0) + (horizon or 0)
         future = max(future, FAR if lasting else rule.reach + later)
     return _Selection(compiled, rules, needs, tuple(rule.factor for rule in rules), Reach(past, future))
 

@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from stlc.compile.ir.traverse import margin_unit
 from stlc.diagnostics import StlcError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.load import load_system_decl
 from stlc.dynamics.scenario import under
 from stlc.grammar import ast
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.monitor.verdict import Monitor
 from stlc.rundir import RunDir
 from stlc.signature import Signature
@@ -156,7 +155,7 @@ def read_contents(run: RunDir) -> RunContents:
     simulation = simulation_of(run)
     read = {name: run.read(name).decode("utf-8", "replace") for name in TEXTS if run.has(name)}
     spec = readable(
-        lambda: replace(parse(Source(RunDir.SPEC, read.get(RunDir.SPEC, ""))), library=run.library())
+        lambda: replace(Spec.parse(Source(RunDir.SPEC, read.get(RunDir.SPEC, ""))), library=run.library())
     )
     scenario = (simulation or {}).get("scenario")
     deployed = decl if decl is None or scenario is None else readable(lambda: under(decl, str(scenario)))
@@ -164,8 +163,8 @@ def read_contents(run: RunDir) -> RunContents:
         run=run,
         record=run.record(),
         rows=run.rows(),
-        requirements={} if spec is None else {i.name: i for i in spec.items if isinstance(i, ast.Require)},
-        outside=spec is not None and any(isinstance(item, ast.Extern) for item in spec.items),
+        requirements={} if spec is None else spec.requirements,
+        outside=spec is not None and bool(spec.functions),
         texts={name: text for name, text in read.items() if text},
         signature=None if decl is None else decl.signature,
         held_out=load_held_out(run),
@@ -211,6 +210,6 @@ def untagged(declared: ast.Require) -> Span:
     return Span(declared.span.source, start, declared.span.end)
 
 
-def _units(spec: ast.Spec, decl: SystemDecl) -> dict[str, str]:
+def _units(spec: Spec, decl: SystemDecl) -> dict[str, str]:
     rules = Monitor(spec, dt=decl.dt, horizon=decl.horizon * decl.dt).compiled.requirements
-    return {rule.name: unit for rule in rules if (unit := margin_unit(rule.typed.formula))}
+    return {rule.name: unit for rule in rules if (unit := rule.typed.formula.margin_unit)}

@@ -10,7 +10,7 @@ import numpy as np
 
 from stlc.diagnostics import usage
 from stlc.files import File
-from stlc.grammar import ast
+from stlc.grammar.spec import Spec
 from stlc.monitor.judgement import Verdict
 from stlc.signature import Column, Signature
 from stlc.trace import Trace
@@ -130,12 +130,12 @@ def _require_trace(traces: int, number: int) -> None:
         raise usage(f"there is no trace {number}", f"they go from 0 to {traces - 1}")
 
 
-def _as_declared(trace: Trace, spec: ast.Spec) -> Trace:
+def _as_declared(trace: Trace, spec: Spec) -> Trace:
     """Return the trace; a column without unit and type has those that the specification declares."""
 
     def declared(column: Column) -> Column:
-        for item in spec.items:
-            if isinstance(item, ast.Signal) and (item.column or item.name) == column.name:
+        for item in spec.signals:
+            if (item.column or item.name) == column.name:
                 if item.unit and not column.unit.text:
                     return replace(column, unit=Unit.parse(item.unit))
                 if item.type and item.type.name == "bool":

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from stlc.compile.ir.traverse import margin_unit
 from stlc.diagnostics import StlcError
 from stlc.grammar import ast
+from stlc.grammar.spec import Spec
 from stlc.monitor.explain.report import Cause
 from stlc.monitor.judgement import RequirementVerdict, Verdict
 from stlc.monitor.verdict import Monitor
@@ -132,7 +132,7 @@ def _least(judgement: RequirementVerdict) -> str:
     least = float(values.min())
     if not np.isfinite(least):
         return "not limited" if least > 0 else "unknown"
-    text = f"{least:+.3f} {margin_unit(judgement.rule.typed.formula)}".rstrip()
+    text = f"{least:+.3f} {judgement.rule.typed.formula.margin_unit}".rstrip()
     return text if judgement.overall == "violated" else text.replace("-0.000", "+0.000")
 
 
@@ -157,11 +157,11 @@ def _caption(trace: Trace, once: list[str]) -> Html:
     return join(words, "Shaded, where the policy did not decide: ", keys)
 
 
-def causes_of(causes: Mapping[str, Cause], names: list[str], spec: ast.Spec) -> Html | None:
+def causes_of(causes: Mapping[str, Cause], names: list[str], spec: Spec) -> Html | None:
     """List with the worst violation of each violated requirement: part of the formula, instant and values."""
     if not causes:
         return None
-    declared = {item.name: item for item in spec.items if isinstance(item, ast.Require)}
+    declared = spec.requirements
     listed = [_cause_html(cause, names, declared.get(cause.name)) for cause in causes.values()]
     return join(el("h3", "Violations and their causes"), listed)
 

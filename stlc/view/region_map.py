@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir import typed
-from stlc.compile.ir.traverse import operands
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import StlcError
 from stlc.grammar import ast
-from stlc.grammar.traverse import descendants
+from stlc.grammar.spec import Spec
 from stlc.monitor.judgement import Verdict
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Signature
@@ -97,7 +96,7 @@ class RegionMap:
         return np.argsort(~self.violated, kind="stable")[:most]
 
 
-def map_of(spec: ast.Spec, verdict: Verdict, trace: Trace, violated: Mask | None = None) -> RegionMap | None:
+def map_of(spec: Spec, verdict: Verdict, trace: Trace, violated: Mask | None = None) -> RegionMap | None:
     """The map of an evaluated trace; None if its specification names no planar regions.
 
     `violated`: the traces to be drawn as violated, (traces,); by default those that `verdict` violates.
@@ -465,7 +464,7 @@ class Plane:
         return xs, ys, region.depth(grid)
 
 
-def plane_of(spec: ast.Spec, rules: Iterable[CompiledRequirement], trace: Trace) -> Plane | None:
+def plane_of(spec: Spec, rules: Iterable[CompiledRequirement], trace: Trace) -> Plane | None:
     """The plane (pair of signals) in which most regions lie; None if the requirements name no region.
 
     Regions that depend on other signals and regions of more than two dimensions are left out.
@@ -475,11 +474,11 @@ def plane_of(spec: ast.Spec, rules: Iterable[CompiledRequirement], trace: Trace)
         rules: its requirements, compiled for recorded traces.
         trace: the trace to evaluate.
     """
-    members = {_key(node.span): node for node in descendants(spec) if isinstance(node, ast.Member)}
+    members = {_key(node.span): node for node in spec.walk() if isinstance(node, ast.Member)}
     uses: dict[tuple[str, str], list[Use]] = {}
     for rule in rules:
-        for pred, use in _uses(rule, trace):
-            node = members.get(_key(pred.span))
+        for span, use in _uses(rule, trace):
+            node = members.get(_key(span))
             if node is not None:
                 if node.negated and _point(node) is not node.item:  # a complement, not a `not` around it
                     use = _turned(use)
@@ -498,12 +497,12 @@ def plane_of(spec: ast.Spec, rules: Iterable[CompiledRequirement], trace: Trace)
     return Plane((axes[0], axes[1]), tuple(planes[axes]))
 
 
-def _membership(spec: ast.Spec, node: ast.Member, trace: Trace) -> Monitor | None:
+def _membership(spec: Spec, node: ast.Member, trace: Trace) -> Monitor | None:
     """Return a monitor of the single predicate `point in region`; None if it cannot be compiled by itself.
 
     For example, the predicate may use an argument of a definition.
     """
-    declared = tuple(item for item in spec.items if not isinstance(item, (ast.Require, ast.Assume)))
+    declared = spec.vocabulary
     formula = replace(node, item=_point(node), negated=False)
     alone = ast.Require(name="inside", name_span=node.span, tags=(), doc="", span=node.span, formula=formula)
     try:
@@ -516,29 +515,23 @@ def _membership(spec: ast.Spec, node: ast.Member, trace: Trace) -> Monitor | Non
 # ------------------------------------------------------------------ in requirements
 
 
-def _uses(rule: CompiledRequirement, trace: Trace) -> Iterator[tuple[typed.Predicate, Use]]:
-    """Yield every predicate of a requirement with a `Use` that describes its place in the requirement.
+def _uses(rule: CompiledRequirement, trace: Trace) -> Iterator[tuple[Span, Use]]:
+    """Yield the text of each predicate of a requirement, and a `Use` for its place in the requirement.
 
     The `Use` tells whether the predicate is under a negation, and to which times it applies.
     """
     stack: list[tuple[typed.Formula, Use]] = [(rule.typed.formula, Use(rule.name, negative=False))]
     while stack:
         node, use = stack.pop()
-        match node:
-            case typed.Predicate():
-                yield node, use
-            case typed.Not(body=body):
-                stack.append((body, _turned(use)))
-            case typed.Logic(op="->", items=(left, right)):
-                stack += [(right, use), (left, _turned(use))]
-            case typed.Temporal(op=op, interval=interval, body=body):
-                inner = replace(_within(interval, use, rule, trace), visit=op in ("eventually", "once"))
-                stack.append((body, inner))
-            case typed.Until(interval=interval, left=left, right=right):
-                inner = replace(_within(interval, use, rule, trace), visit=True)
-                stack += [(right, inner), (left, use)]
-            case _:
-                stack += [(part, use) for part in reversed(operands(node))]
+        operator, parts, places = node.temporal, node.operands, [use] * len(node.operands)
+        if not parts and node.children:
+            yield node.span, use
+        elif node.word in ("not", "->"):
+            places[0] = _turned(use)
+        elif operator is not None:
+            visit = len(parts) > 1 or operator.op in ("eventually", "once")
+            places[-1] = replace(_within(operator.interval, use, rule, trace), visit=visit)
+        stack += reversed([*zip(parts, places, strict=True)])
 
 
 def _turned(use: Use) -> Use:

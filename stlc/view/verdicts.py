@@ -12,11 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.backends.array.graph import robustness_signal
-from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import margin_unit, nodes
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.grammar import ast
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.monitor.explain.report import violations
 from stlc.monitor.judgement import RequirementVerdict, Verdict
 from stlc.monitor.verdict import Monitor, robustness_signals
@@ -52,8 +49,8 @@ def monitor_of(
         SpecError: the specification is invalid.
     """
     carried = trace.meta.carried if drives else trace.meta.planned
-    spec = replace(parse(Source("spec.stl", carried.text or text)), library=carried.library)
-    outside = any(isinstance(item, ast.Extern) for item in spec.items)
+    spec = replace(Spec.parse(Source("spec.stl", carried.text or text)), library=carried.library)
+    outside = bool(spec.functions)
     return Monitor(spec, system=system if outside else None, overrides=carried.overrides)
 
 
@@ -77,43 +74,22 @@ def _demanded(judgement: RequirementVerdict, verdict: Verdict, whole: Floats) ->
 
     The result is `whole` for a trace in which this is not known, or does not decide the requirement.
     """
-    demands = demands_of(judgement.rule.formula)
+    demands = judgement.rule.formula.demands
     if not demands:
         return whole
     record, rho = verdict.subject.record, np.full_like(whole, np.nan)
-    for demand in demands:
-        signal = robustness_signal(
-            demand.body, record.env, ops=record.ops, semantics=record.semantics, end="strict"
-        )
+    for first, body in demands:
+        signal = robustness_signal(body, record.env, ops=record.ops, semantics=record.semantics, end="strict")
         own = np.array(np.broadcast_to(np.asarray(signal, dtype=float).T, whole.shape))
-        own[:, : demand.first] = np.nan
+        own[:, :first] = np.nan
         rho = np.fmin(rho, own)
     decides = np.isclose(np.where(np.isnan(rho), np.inf, rho).min(1), whole[:, 0], rtol=1e-6, atol=TOLERANCE)
     return np.where(decides[:, None], rho, whole)
 
 
-@dataclass(frozen=True, slots=True)
-class Demand:
-    """Formula that a requirement demands at all samples from `first` on."""
-
-    first: int
-    body: ir.Formula
-
-
-def demands_of(formula: ir.Formula) -> list[Demand]:
-    """Formulas that `formula` demands at all samples; none unless it is `always p`, or several of these."""
-    match formula:
-        case ir.Temporal("always", ir.Window(first, None), body):
-            return [Demand(first, body)]
-        case ir.BoolOp("and", items):
-            each = [demands_of(item) for item in items]
-            return [demand for demands in each for demand in demands] if all(each) else []
-    return []
-
-
 def units_of(verdict: Verdict) -> dict[str, str]:
     """Mapping from requirements to the units of their robustness; it omits requirements without a unit."""
-    return {j.name: unit for j in verdict if (unit := margin_unit(j.rule.typed.formula))}
+    return {j.name: unit for j in verdict if (unit := j.rule.typed.formula.margin_unit)}
 
 
 def marks_of(verdict: Verdict, trace: Trace) -> Marks:
@@ -121,14 +97,11 @@ def marks_of(verdict: Verdict, trace: Trace) -> Marks:
     columns = {each.name: each for each in trace.signature.columns}
     thresholds: dict[str, list[float]] = {}
     for judgement in verdict:
-        for part in nodes(judgement.rule.formula):
-            match part:
-                case ir.Predicate(
-                    ir.Op("sub", (ir.Signal(name), ir.Const(value)) | (ir.Const(value), ir.Signal(name)))
-                ) if name in columns:
-                    unit = columns[name].unit
-                    shown = (value - float(unit.offset)) / unit.scale
-                    thresholds[name] = list(dict.fromkeys([*thresholds.get(name, ()), shown]))
+        for name, value in filter(None, (atom.threshold for atom in judgement.rule.formula.predicates())):
+            if name in columns:
+                unit = columns[name].unit
+                shown = (value - float(unit.offset)) / unit.scale
+                thresholds[name] = list(dict.fromkeys([*thresholds.get(name, ()), shown]))
     deciding = []
     for cause in verdict.causes.values():
         leaf, first = cause.tree.leaf, cause.first
@@ -146,7 +119,7 @@ def _judged_once(verdict: Verdict) -> list[RequirementVerdict]:
 
 def judged_at_start(verdict: Verdict) -> list[str]:
     """Names of the requirements that are evaluated once, and do not demand the same at all times."""
-    return [each.name for each in _judged_once(verdict) if not demands_of(each.rule.formula)]
+    return [each.name for each in _judged_once(verdict) if not each.rule.formula.demands]
 
 
 def violating(trace: Trace, verdict: Verdict, *, system: Source | None = None) -> Mask:

@@ -19,7 +19,7 @@ from stlc.dynamics.load import parse_system
 from stlc.dynamics.scenario import under
 from stlc.dynamics.system import System
 from stlc.dynamics.uncertainty.disturbance import Disturbance
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 SYSTEM = """\
@@ -48,7 +48,7 @@ require wall: always[0, T] p < 1 m
 @cache
 def task_of(scenario: str | None, spec: str = SPEC) -> Task:
     decl = parse_system(Source("cart.yaml", SYSTEM), Path("cart.yaml"), {})
-    return Task.of(parse(Source("cart.stl", spec)), System(under(decl, scenario) if scenario else decl))
+    return Task.of(Spec.parse(Source("cart.stl", spec)), System(under(decl, scenario) if scenario else decl))
 
 
 class Constant(Policy):

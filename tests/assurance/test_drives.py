@@ -28,7 +28,7 @@ from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.world import ModelWorld, independent_agents
 from stlc.dynamics.system import System
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.jsontext import plain
 from stlc.registry import METHODS
 from stlc.source import Source
@@ -40,7 +40,7 @@ SMALL = {"test.steps": "30", "test.agents": "4", "test.world": "null"}
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """An untrained car."""
-    spec = parse(File(ROOT / "specs" / "traffic.stl").read())
+    spec = Spec.parse(File(ROOT / "specs" / "traffic.stl").read())
     task = Task.of(spec, System.load(ROOT / "examples" / "car.yaml", SMALL))
     config = TrainConfig()
     folder = open_folder(task, config, Launch(root=tmp_path_factory.mktemp("runs")))
@@ -87,7 +87,7 @@ def test_a_drive_that_ends_before_a_window_may_be_undecided(
     tmp_path: Path, formula: str, values: list[float], satisfied: bool, violated: bool, least: float
 ) -> None:
     (tmp_path / "cart.yaml").write_text(moved_by_steps("cart", "uniform(0, 1)", horizon=6))
-    spec = parse(Source("cart.stl", f"signal x\nrequire r: {formula}"))
+    spec = Spec.parse(Source("cart.stl", f"signal x\nrequire r: {formula}"))
     task = Task.of(spec, System.load(tmp_path / "cart.yaml"))
     states = np.zeros((2, 4, len(task.system.names)))
     states[:, :, task.system.names.index("x")] = values
@@ -103,7 +103,7 @@ def test_a_drive_that_ends_before_a_window_may_be_undecided(
 
 def test_drives_that_violate_an_assumption_are_left_out(tmp_path: Path) -> None:
     (tmp_path / "cart.yaml").write_text(moved_by_steps("cart", "uniform(0, 1)", horizon=3))
-    spec = parse(
+    spec = Spec.parse(
         Source("cart.stl", "signal x\nassume calm: always[0 s, 3 s] x < 4\nrequire r: always[0 s, 3 s] x < 2")
     )
     task = Task.of(spec, System.load(tmp_path / "cart.yaml"))

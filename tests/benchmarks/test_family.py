@@ -25,7 +25,7 @@ from stlc.controller.run.run import Run
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.loop import train
 from stlc.grammar import ast
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.rundir import RunDir
 from stlc.source import Source
 
@@ -56,7 +56,7 @@ def test_at_the_value_of_the_benchmark_a_family_is_the_benchmark(
 ) -> None:
     (parameter,) = [each.parameter for each in FAMILIES if each.name == family]
     own = load(benchmark)
-    spec = parse(Source(str(spec_path(family)), spec_path(family).read_text()))
+    spec = Spec.parse(Source(str(spec_path(family)), spec_path(family).read_text()))
     same = Task.of(spec, own.plain, overrides={parameter: value})
     assert [(rule.name, rule.tags) for rule in same.rules] == [(rule.name, rule.tags) for rule in own.rules]
     assert [item for item in spec.items if isinstance(item, ast.Param)]

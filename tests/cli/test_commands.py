@@ -12,7 +12,7 @@ from stlc.cli.framework.app import main
 from stlc.cli.framework.watch import watch
 from stlc.dynamics.load import load_system_decl
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -200,7 +200,7 @@ def test_a_new_specification_is_valid(arguments, capsys):
     assert main(["fmt", str(path), "--check"]) == 0
     system = ["--system", arguments[1]] if arguments else []
     assert main(["lint", str(path), "--strict", *system]) == 0, capsys.readouterr().out
-    spec = parse(File(path).read())
+    spec = Spec.parse(File(path).read())
     assert spec.name == "parking"
     if arguments:
         decl = load_system_decl(Path("specs") / str(spec.system))

@@ -9,13 +9,13 @@ import pytest
 from stlc.compile.deadlines import beyond_plans, unreached
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import Compiled, compile_spec
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 
 def compiled(formula: str) -> Compiled:
     text = f"state signal x [m]\nrequire r: {formula}"
-    return compile_spec(parse(Source("s.stl", text)), grid=Grid(Fraction(1, 2), 20))
+    return compile_spec(Spec.parse(Source("s.stl", text)), grid=Grid(Fraction(1, 2), 20))
 
 
 @pytest.mark.parametrize(

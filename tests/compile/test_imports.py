@@ -14,16 +14,14 @@ from hypothesis import given, settings
 
 from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.frontend.modules import file_of, library_of, spec_sha256
 from stlc.compile.frontend.resolve import resolve
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
-from stlc.compile.ir.lower import lower
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import Diagnostic, SpecError, StlcError
 from stlc.files import File
 from stlc.grammar import ast
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec, file_of
 from stlc.monitor.explain.report import explain
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
@@ -59,7 +57,7 @@ def files(tmp_path: Path) -> Path:
 
 
 def typed_of(path: Path) -> typed.Spec:
-    return resolve(parse(File(path).read()), sink=[])
+    return resolve(Spec.parse(File(path).read()), sink=[])
 
 
 def findings(path: Path) -> list[Diagnostic]:
@@ -72,7 +70,7 @@ def inlined() -> typed.Spec:
     text = GEO.replace("require not_taken: x > 0 m", "signal y [m]") + (
         "def p = [x, y]\nrequire a: always[0, T] clear(p)\nrequire b: near(3 m) and p in pond\n"
     )
-    return resolve(parse(Source("one.stl", text)), sink=[])
+    return resolve(Spec.parse(Source("one.stl", text)), sink=[])
 
 
 def test_an_import_means_what_writing_it_out_means(files: Path) -> None:
@@ -130,35 +128,36 @@ def test_files_import_files_and_each_has_its_own_names(files: Path) -> None:
     )
     files.write_text('import "b.stl"\nrequire r: b.far and b.g.near(1 m)\n', encoding="utf-8")
     (rule,) = typed_of(files).requirements
-    lowered = lower(rule.formula, Grid(), [])
+    lowered = Grid().lower(rule.formula, [])
     signal = robustness_signal(lowered, {"x": np.array([[9.75]])}, ops=NUMPY)
     assert signal[0, 0] == pytest.approx(min(9.75 - 9.5, 1.5 - 9.75))
 
 
 def test_texts_that_are_kept_stand_for_the_files(files: Path) -> None:
-    spec = parse(File(files).read())
-    library = library_of(spec)
+    spec = Spec.parse(File(files).read())
+    library = spec.imported_texts()
     assert set(library) == {"../shapes/geo.stl", "@std"}
     assert len({file_of(key) for key in library}) == 2
     assert all(".." not in file_of(key) for key in library)
-    moved = replace(parse(Source("elsewhere/spec.stl", MAIN)), library=library)
+    moved = replace(Spec.parse(Source("elsewhere/spec.stl", MAIN)), library=library)
     assert [r.formula for r in resolve(moved, sink=[]).requirements] == [
         r.formula for r in typed_of(files).requirements
     ]
-    assert spec_sha256(MAIN, library) != spec_sha256(MAIN, {**library, "@std": ""}) != spec_sha256(MAIN, {})
+    other, alone = replace(moved, library={**library, "@std": ""}), Spec.parse(Source("s.stl", ""))
+    assert spec.sha256 == moved.sha256 != other.sha256 != alone.sha256
 
 
 def test_a_trace_carries_what_its_specification_imports(files: Path, tmp_path: Path) -> None:
-    spec = parse(File(files).read())
+    spec = Spec.parse(File(files).read())
     compiled = compile_spec(spec, grid=Grid(Fraction(1, 10), 5))
-    meta = TraceMeta(spec_name="main", spec_text=MAIN, spec_library=library_of(spec), horizon=5, dt=0.1)
+    meta = TraceMeta(spec_name="main", spec_text=MAIN, spec_library=spec.imported_texts(), horizon=5, dt=0.1)
     data = {"x": np.full((1, 6), 0.5), "y": np.full((1, 6), 9.0)}
     Trace(signature=compiled.signature, dt=0.1, data=data, meta=meta).save(tmp_path / "t.npz")
     files.unlink()
     (tmp_path / "shapes/geo.stl").unlink()
     trace = Trace.load(tmp_path / "t.npz")
     assert trace.meta.spec_library == meta.spec_library
-    judge = Monitor(replace(parse(Source("t", trace.meta.spec_text)), library=trace.meta.spec_library))
+    judge = Monitor(replace(Spec.parse(Source("t", trace.meta.spec_text)), library=trace.meta.spec_library))
     verdict = judge.check(trace)
     assert verdict["a"].overall == "satisfied"
     assert verdict["b"].overall == "violated"
@@ -182,7 +181,7 @@ PATTERNS = {
 
 def pattern(text: str) -> typed.Formula:
     return (
-        resolve(parse(Source("s.stl", f"import std\nsignal x, y\nrequire r: {text}")), sink=[])
+        resolve(Spec.parse(Source("s.stl", f"import std\nsignal x, y\nrequire r: {text}")), sink=[])
         .requirements[0]
         .formula
     )
@@ -198,7 +197,7 @@ def test_patterns_are_what_they_say(short: str, long: str) -> None:
 @given(env=traces(low=2, batch=1))
 def test_patterns_by_the_definition(text: str, env: dict[str, np.ndarray]) -> None:
     formula = pattern(text)
-    signal = robustness_signal(lower(formula, GRID, []), env, ops=NUMPY, end="truncate")[:, 0]
+    signal = robustness_signal(GRID.lower(formula, []), env, ops=NUMPY, end="truncate")[:, 0]
     judge = reference.Robustness(
         reference.Trace({name: x[:, 0] for name, x in env.items()}, GRID, "truncate")
     )
@@ -208,20 +207,19 @@ def test_patterns_by_the_definition(text: str, env: dict[str, np.ndarray]) -> No
 
 def test_a_bare_time_takes_the_unit_of_the_file_that_calls() -> None:
     text = "time ms\nimport std\nsignal x\nrequire r: std.response(x > 0, x > 1, 200)"
-    (rule,) = resolve(parse(Source("s.stl", text)), sink=[]).requirements
+    (rule,) = resolve(Spec.parse(Source("s.stl", text)), sink=[]).requirements
     later = next(node for node in rule.formula.items if isinstance(node, typed.Temporal))  # type: ignore[union-attr]
     assert later.interval.hi is not None
     assert later.interval.hi.seconds == Fraction(1, 5)
 
 
 def test_the_library_documents_every_pattern() -> None:
-    from stlc.compile.frontend import modules
-
-    spec = parse(File(modules._STD_FILE).read())
+    (module,) = Spec.parse(Source("s.stl", "import std\n")).modules()
+    spec = module.spec
     assert all(isinstance(item, ast.Def) and item.doc for item in spec.items)
     assert {item.name for item in spec.items} == set(PATTERNS)
     with pytest.raises(SpecError):
-        resolve(parse(Source("s.stl", "import std\nrequire r: std.nothing")), sink=[])
+        resolve(Spec.parse(Source("s.stl", "import std\nrequire r: std.nothing")), sink=[])
 
 
 def test_files_that_import_each_other_twice_do_not_multiply(tmp_path: Path) -> None:

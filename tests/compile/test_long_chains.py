@@ -9,7 +9,7 @@ import torch
 import stlc
 from stlc.grammar.english import sentence
 from stlc.grammar.format.format import format_text
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.lint.lint import lint
 from stlc.source import Source
 
@@ -29,8 +29,8 @@ def test_a_long_chain_is_judged_like_a_short_one(sign, value, count):
     source = Source("long.stl", f"signal x\nrequire r: always[0 s, 1 s] ({body})\n")
     assert [one for one in lint(source) if one.severity == "error"] == []
     formatted = format_text(source)
-    assert parse(Source("long.stl", formatted)) == parse(source)
-    assert sentence(parse(source).items[1])
+    assert Spec.parse(Source("long.stl", formatted)) == Spec.parse(source)
+    assert sentence(Spec.parse(source).items[1])
     x = np.array([1.0, 2.5, 3.0])
     expected = min(value(np.arange(count) % 7 - one) for one in x[:2])
     monitor = stlc.Monitor(source.text, dt=1)

@@ -15,15 +15,13 @@ from stlc.compile.frontend.scope import (
     Known,
     Scope,
     column_entries,
-    constant_value,
-    enforced,
     member_entries,
 )
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.diagnostics import SpecError, StlcError, SystemFileError
 from stlc.grammar.parser import parse_expr
-from stlc.signature import Column
+from stlc.signature import Column, Signature
 from stlc.source import Source
 from stlc.units import Unit
 
@@ -41,9 +39,9 @@ COLUMNS = (
     Column("q[1]", Unit.parse("m")),
 )
 CONSTANTS = {
-    "amax": Known(constant_value(10.0, Unit.parse("m/s^2"))),
-    "dt": Known(constant_value(0.1, Unit.parse("s"))),
-    "two": Known(constant_value(2.0, Unit.ONE)),
+    "amax": Known(Number.fixed(10.0, Unit.parse("m/s^2"))),
+    "dt": Known(Number.fixed(0.1, Unit.parse("s"))),
+    "two": Known(Number.fixed(2.0, Unit.ONE)),
 }
 ROW = {"x": 3.0, "v": 2.0, "psi": 90.0, "d": 1.5, "free": 0.25, "sign": 1.0, "yielding": 0.0, "gear": 3.0}
 ROW |= {"q[0]": 3.0, "q[1]": -4.0}
@@ -52,7 +50,7 @@ ROW |= {"q[0]": 3.0, "q[1]": -4.0}
 def scope(**settings: object) -> Scope:
     entries = {**column_entries(COLUMNS), **member_entries([LABELS]), **CONSTANTS}
     entries["has_lead"] = Definition("has_lead", parse_expr(Source("d", "x >= 0")))
-    given_ = {"error": SystemFileError, "ranges": enforced(COLUMNS), **settings}
+    given_ = {"error": SystemFileError, "ranges": Signature(COLUMNS).enforced, **settings}
     return Scope(entries, **given_)  # type: ignore[arg-type]
 
 

@@ -13,7 +13,7 @@ from stlc.compile import pipeline
 from stlc.compile.frontend import resolve as resolving
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.ir.discretize import Grid
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.lint.lint import Surroundings, lint
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
@@ -50,8 +50,8 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Counted:
 
     watch(resolving, "declared", lambda spec, *_: spec.name)
     watch(resolving, "resolve_formula", lambda expr, *_: expr.span)
-    watch(pipeline, "in_samples", lambda formula, *_: formula.span)
-    watch(pipeline, "lower", lambda formula, *_: formula)
+    watch(Grid, "in_samples", lambda _, formula, *_rest: formula.span)
+    watch(Grid, "lower", lambda _, formula, *_rest: formula)
     return found
 
 
@@ -61,7 +61,7 @@ def stage(found: Counted, name: str) -> list[int]:
 
 @pytest.mark.parametrize("purpose", ["train", "check"])
 def test_compiling_takes_every_stage_once(counted: Counted, purpose: pipeline.Purpose) -> None:
-    pipeline.compile_spec(parse(Source("a.stl", TEXT)), grid=GRID, interface=SYSTEM, purpose=purpose)
+    pipeline.compile_spec(Spec.parse(Source("a.stl", TEXT)), grid=GRID, interface=SYSTEM, purpose=purpose)
     assert stage(counted, "declared") == [1]
     assert stage(counted, "resolve_formula") == [1] * 4
     assert stage(counted, "in_samples") == [1] * 4

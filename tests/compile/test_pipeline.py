@@ -18,7 +18,7 @@ from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.text import show_formula
 from stlc.compile.pipeline import Compiled, Purpose, compile_spec
 from stlc.diagnostics import SpecError
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 ROOT = Path(__file__).parents[2]
@@ -27,7 +27,7 @@ SIGNALS = "signal x [m]\nsignal y [m]\n"
 
 
 def compiled(text: str, grid: Grid = GRID, purpose: Purpose = "train") -> Compiled:
-    return compile_spec(parse(Source("a.stl", SIGNALS + text)), grid=grid, purpose=purpose)
+    return compile_spec(Spec.parse(Source("a.stl", SIGNALS + text)), grid=grid, purpose=purpose)
 
 
 def errors(text: str, grid: Grid = GRID, purpose: Purpose = "train") -> list[str]:
@@ -38,7 +38,7 @@ def errors(text: str, grid: Grid = GRID, purpose: Purpose = "train") -> list[str
 
 def traffic() -> Compiled:
     path = ROOT / "specs" / "traffic.stl"
-    return compile_spec(parse(Source("specs/traffic.stl", path.read_text())), grid=GRID)
+    return compile_spec(Spec.parse(Source("specs/traffic.stl", path.read_text())), grid=GRID)
 
 
 def test_traffic() -> None:

@@ -11,7 +11,7 @@ from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.dynamics.system import System
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[2]
@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 @pytest.fixture(scope="session")
 def car_task() -> Task:
     """`specs/traffic.stl` with `examples/car.yaml`."""
-    spec = parse(File(ROOT / "specs" / "traffic.stl").read())
+    spec = Spec.parse(File(ROOT / "specs" / "traffic.stl").read())
     return Task.of(spec, System.load(ROOT / "examples" / "car.yaml"))
 
 

@@ -14,7 +14,7 @@ from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.dynamics.system import System
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 
 DATA = Path(__file__).parent.parent / "data"
 
@@ -39,7 +39,7 @@ def home(tmp_path: Path) -> Path:
 
 
 def test_a_run_stands_on_its_own(home: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    task = Task.of(parse(File(home / "arm.stl").read()), System.load(home / "arm.yaml"))
+    task = Task.of(Spec.parse(File(home / "arm.stl").read()), System.load(home / "arm.yaml"))
     folder = open_folder(task, TrainConfig(), Launch(root=tmp_path_factory.mktemp("runs")))
     x = torch.randn(200, 6, 2, generator=torch.Generator().manual_seed(0))
     wanted = task.robustness(x)

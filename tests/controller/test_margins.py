@@ -15,7 +15,7 @@ from stlc.diagnostics import UsageError
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.scenario import under
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 SYSTEM = """\
@@ -46,7 +46,7 @@ require q_up: eventually[0, T] q > 1 m
 
 def task_of(scenario: str) -> Task:
     decl = parse_system(Source("belt.yaml", SYSTEM), Path("belt.yaml"))
-    return Task.of(parse(Source("a.stl", SPEC)), System(under(decl, scenario)))  # type: ignore[arg-type]
+    return Task.of(Spec.parse(Source("a.stl", SPEC)), System(under(decl, scenario)))  # type: ignore[arg-type]
 
 
 class Onward(Policy):

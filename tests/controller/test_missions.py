@@ -22,7 +22,7 @@ from stlc.controller.training.learner import Trainer
 from stlc.controller.training.samplers import GLIMPSES, POOL, Draws, Missions
 from stlc.controller.world import ModelWorld
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 
@@ -60,7 +60,7 @@ def system(tmp_path: Path) -> System:
 
 
 def task_of(text: str, system: System) -> Task:
-    return Task.of(parse(Source("line.stl", text)), system)
+    return Task.of(Spec.parse(Source("line.stl", text)), system)
 
 
 @pytest.fixture
@@ -211,7 +211,7 @@ def test_deployment_carries_memory_from_the_true_states(task: Task) -> None:
 def test_what_was_driven_is_judged_as_it_was_written(task: Task) -> None:
     recording = deployed(task)
     executed = judge_executed(task, recording)
-    monitor = Monitor(parse(Source("line.stl", MISSION)), dt=0.1, horizon=0.8)
+    monitor = Monitor(Spec.parse(Source("line.stl", MISSION)), dt=0.1, horizon=0.8)
     signals = {name: recording.states[..., i] for i, name in enumerate(task.system.names)}
     verdict = monitor.check(signals)
     for judgement in verdict.requirements:

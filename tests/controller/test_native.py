@@ -12,7 +12,7 @@ from stlc.controller.problem.task import Task
 from stlc.controller.training.objective import guided_objective, loss
 from stlc.diagnostics import Notice
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
@@ -31,7 +31,7 @@ INSIDE = "def hand(q) = [q[0] * 2 m - q[0]^3 / 6 * 1 m, q[1] * 2 m - q[1]^3 / 6 
 
 
 def _task(extern: str, body: str) -> Task:
-    return Task.of(parse(Source("arm.stl", SPEC.format(extern=extern, body=body))), System.load(ARM))
+    return Task.of(Spec.parse(Source("arm.stl", SPEC.format(extern=extern, body=body))), System.load(ARM))
 
 
 def test_a_function_in_python_leaves_the_work_to_torch_with_the_same_results() -> None:

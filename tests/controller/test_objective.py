@@ -25,7 +25,7 @@ from stlc.controller.training.objective import VIOLATION, Objective, guided_obje
 from stlc.diagnostics import SpecError
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 
@@ -101,7 +101,7 @@ def test_plans_that_fail_a_formula_of_the_past_are_told_how_to_satisfy_it(
     path = Path("cart.yaml")
     system = System(parse_system(Source(str(path), CART), path, {}))
     text = f"import std\nstate signal x [m]\nstate signal v [m/s]\nrequire r: {formula}"
-    task = Task.of(parse(Source("cart.stl", text)), system)
+    task = Task.of(Spec.parse(Source("cart.stl", text)), system)
     x0 = task.sample(64, seed=1)
     u = torch.full((64, 20, 1), 0.3, requires_grad=True)
     for objective in (paper_objective(task), guided_objective(0.1, slope=5.0, performance_weight=0.0)):
@@ -130,7 +130,7 @@ def compiled_for_plane(formulas: Sequence[typed.Formula]) -> Task:
     path = Path("plane.yaml")
     system = System(parse_system(Source(str(path), PLANE), path, {}))
     text = "state signal x, y, z\nrequire r: always[0, T] x > -99"
-    spec = resolve_for(parse(Source("plane.stl", text)), system.interface(), None, "train")
+    spec = resolve_for(Spec.parse(Source("plane.stl", text)), system.interface(), None, "train")
     rules = tuple(replace(requirement(formula), name=f"r{i}") for i, formula in enumerate(formulas))
     try:
         return Task(compile_resolved(replace(spec, requirements=rules), Grid(Fraction(1, 10), 5)), system)
@@ -191,7 +191,7 @@ def test_a_missed_deadline_drops_out_of_the_loss_and_leaves_the_other_requiremen
     late = "require a: eventually@[0 s, 4 s] ((always[0 s, 0.2 s] x > 0.8) and x < 2)"
     near = "require b: always[0, T] y > 1"
     both, alone, lost = (
-        Task.of(parse(Source("s.stl", f"state signal x, y, z\n{rules}")), system)
+        Task.of(Spec.parse(Source("s.stl", f"state signal x, y, z\n{rules}")), system)
         for rules in (f"{late}\n{near}", near, late)
     )
     if not native:

@@ -25,7 +25,7 @@ from stlc.controller.training.loop import train
 from stlc.diagnostics import StlcError, TraceError
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 
@@ -64,7 +64,7 @@ def system(text: str = SYSTEM, **overrides: str) -> System:
 
 
 def task_of(text: str = SPEC, **overrides: str) -> Task:
-    return Task.of(parse(Source("around.stl", text)), system(**overrides), overrides=overrides)
+    return Task.of(Spec.parse(Source("around.stl", text)), system(**overrides), overrides=overrides)
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,7 @@ def test_a_value_given_at_compile_time_is_a_constant() -> None:
 
 def test_a_parameter_that_the_system_carries_is_the_systems() -> None:
     carried = SYSTEM.replace("control:", "param: {r: {unit: m, range: [0.5, 1.5]}}\ncontrol:")
-    spec = parse(Source("around.stl", SPEC))
+    spec = Spec.parse(Source("around.stl", SPEC))
     task = Task.of(spec, system(carried))
     assert task.system.names == ("x", "y", "r", "c[0]", "c[1]", "far")
     assert task.plain.names == ("x", "y", "r")
@@ -146,7 +146,7 @@ def test_it_must_agree_with_the_system(param: str, code: str) -> None:
     carried = SYSTEM.replace("control:", "param: {r: {unit: m, range: [0.5, 1.5]}}\ncontrol:")
     text = SPEC.replace("param r [m] in [0.5, 1.5]", param)
     with pytest.raises(StlcError) as caught:
-        Task.of(parse(Source("around.stl", text)), system(carried))
+        Task.of(Spec.parse(Source("around.stl", text)), system(carried))
     assert code in {finding.code for finding in caught.value.diagnostics}
 
 
@@ -177,7 +177,7 @@ def test_an_interval_takes_constants_alone_unless_the_value_is_given() -> None:
 
 def test_bare_numbers_of_a_distribution_are_in_the_unit_that_is_declared() -> None:
     compiled = compile_spec(
-        parse(Source("a.stl", "param w [ms] ~ normal(200, 1 ms)\nrequire a: w > 0\n")),
+        Spec.parse(Source("a.stl", "param w [ms] ~ normal(200, 1 ms)\nrequire a: w > 0\n")),
         grid=Grid(system().decl.dt, 10),
     )
     (each,) = compiled.parameters

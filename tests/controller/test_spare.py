@@ -21,7 +21,7 @@ from stlc.controller.world import world_type
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.scenario import under
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 SYSTEM = """\
@@ -45,7 +45,7 @@ require quick: eventually[0, T] w >= 0.1
 
 def task_of(scenario: str = "") -> Task:
     decl = parse_system(Source("cart.yaml", SYSTEM), Path("cart.yaml"))
-    return Task.of(parse(Source("a.stl", SPEC)), System(under(decl, scenario) if scenario else decl))  # type: ignore[arg-type]
+    return Task.of(Spec.parse(Source("a.stl", SPEC)), System(under(decl, scenario) if scenario else decl))  # type: ignore[arg-type]
 
 
 class Onward(Policy):
@@ -85,7 +85,7 @@ def test_robustness_is_less_by_the_margin(car_task: Task) -> None:
 def test_time_tests_stay_and_negated_predicates_are_tightened_too() -> None:
     guard = Predicate(Signal("t"), guard=True)
     assert tightened(guard, Const(1.0)) is guard
-    task = Task.of(parse(Source("a.stl", SPEC.replace("p <= 2", "not (p > 2)"))), task_of().plain)
+    task = Task.of(Spec.parse(Source("a.stl", SPEC.replace("p <= 2", "not (p > 2)"))), task_of().plain)
     x0 = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
     still = torch.zeros((1, 6, 1), dtype=torch.float64)
     assert float(with_margins(task, {"clear": 0.5}).judge(x0, still).requirements[0, 0]) == pytest.approx(0.5)
@@ -136,7 +136,7 @@ def test_what_nobody_has_planned_is_no_danger() -> None:
     """As the model says, a safe plan stays safe to its end, also where `sweep` looks beyond that."""
     decl = parse_system(Source("cart.yaml", SYSTEM), Path("cart.yaml"))
     spec = "signal p, w\n@safety\nrequire clear: always[0, T] sweep([p, 0]) not in box([2.2, -1], [9, 1])\n"
-    task, planned = Task.of(parse(Source("a.stl", spec)), System(decl)), []  # type: ignore[arg-type]
+    task, planned = Task.of(Spec.parse(Source("a.stl", spec)), System(decl)), []  # type: ignore[arg-type]
 
     class Faster(Onward):
         def candidates(self, x0: Tensor) -> Tensor:

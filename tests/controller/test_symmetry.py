@@ -13,7 +13,7 @@ from stlc.controller.training.diagnose import check_mirror
 from stlc.diagnostics import SystemFileError
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 ROOT = Path(__file__).parent.parent.parent
@@ -31,7 +31,7 @@ def _task(spec: str, old: str = "", new: str = "") -> Task:
     assert old in text
     decl = parse_system(Source(path.name, text.replace(old, new) if old else text), path)
     source = Source(f"{spec}.stl", (ROOT / "specs" / f"{spec}.stl").read_text())
-    return Task.of(parse(source), System(decl))
+    return Task.of(Spec.parse(source), System(decl))
 
 
 @pytest.mark.parametrize("spec", PAIRS)

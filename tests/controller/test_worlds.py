@@ -15,7 +15,7 @@ from stlc.controller.search.feasibility import solvable, viable
 from stlc.controller.world import ModelWorld, world_type
 from stlc.diagnostics import RunError, SystemFileError
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -38,7 +38,7 @@ SPEC = "@safety require near: always x < 3 m\nrequire home: eventually x < 1 m\n
 def cart(tmp_path: Path, test: str, drawn: str = "uniform(0, 4)") -> Task:
     """By default drawn evenly from 0 to 4 m: safe below 3, home within reach below about 1.4."""
     (tmp_path / "cart.yaml").write_text(CART.replace("uniform(0, 4)", drawn) + f"test: {{{test}}}\n")
-    return Task.of(parse(Source("cart.stl", SPEC)), System.load(tmp_path / "cart.yaml"))
+    return Task.of(Spec.parse(Source("cart.stl", SPEC)), System.load(tmp_path / "cart.yaml"))
 
 
 def begun(task: Task, *seeds: int, agents: int = 30) -> tuple[torch.Tensor, int]:

@@ -15,7 +15,7 @@ from stlc.controller.problem.task import Task
 from stlc.diagnostics import SpecError, StlcError, SystemFileError, UsageError
 from stlc.dynamics.load import load_system_decl
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 
@@ -34,7 +34,7 @@ region post = circle([1, 1], 0.5)
 
 
 def task(text: str) -> Task:
-    return Task.of(parse(Source("arm.stl", HEAD + text)), System.load(ARM))
+    return Task.of(Spec.parse(Source("arm.stl", HEAD + text)), System.load(ARM))
 
 
 def expected(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
@@ -65,7 +65,7 @@ def test_numbers_pass_one_by_one() -> None:
     "text", ["hand(q) not in post", "span(a, b) < 4", "freeze h = hand(q) in dist(h, hand(q)) < 3"]
 )
 def test_a_trace_is_judged_by_the_system_that_is_given(text: str) -> None:
-    spec = parse(Source("arm.stl", f"{HEAD}require r: always[0, T] {text}"))
+    spec = Spec.parse(Source("arm.stl", f"{HEAD}require r: always[0, T] {text}"))
     rng = np.random.default_rng(1)
     signals = {name: rng.normal(size=(3, 6)) for name in "ab"}
     found = Monitor(spec, system=ARM).robustness(signals, at=0)
@@ -76,7 +76,7 @@ def test_a_trace_is_judged_by_the_system_that_is_given(text: str) -> None:
 def test_nothing_is_loaded_to_compile_or_lint(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.spec_from_file_location", lambda *_: pytest.fail("loaded"))
     decl = load_system_decl(ARM)
-    spec = parse(Source("arm.stl", f"{HEAD}require r: hand(q) not in post"))
+    spec = Spec.parse(Source("arm.stl", f"{HEAD}require r: hand(q) not in post"))
     compiled = compile_spec(spec, grid=Grid(decl.dt, decl.horizon), interface=decl.interface())
     assert compiled.requirements
     with pytest.raises(UsageError) as caught:
@@ -137,7 +137,7 @@ def changed(old: str, new: str, folder: Path) -> Path:
 def test_what_cannot_be_loaded(new: str, words: str, tmp_path: Path) -> None:
     path = changed("arm_kinematics.py:hand", new, tmp_path)
     with pytest.raises(SystemFileError) as caught:
-        Task.of(parse(Source("arm.stl", f"{HEAD}require r: a > 0")), System.load(path))
+        Task.of(Spec.parse(Source("arm.stl", f"{HEAD}require r: a > 0")), System.load(path))
     (finding,) = caught.value.diagnostics
     assert finding.code == "S208"
     assert words in " ".join((*finding.help, *finding.note))
@@ -153,6 +153,6 @@ def test_a_target_that_is_none(new: str, tmp_path: Path) -> None:
 def test_a_module_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = changed("arm_kinematics.py:hand", "arm_kinematics:hand", tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    spec = parse(Source("arm.stl", f"{HEAD}require r: norm(hand(q)) < 3"))
+    spec = Spec.parse(Source("arm.stl", f"{HEAD}require r: norm(hand(q)) < 3"))
     assert torch.isfinite(Task.of(spec, System.load(path)).robustness(torch.zeros(1, 6, 2))).all()
     sys.modules.pop("arm_kinematics")

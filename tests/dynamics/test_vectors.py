@@ -13,7 +13,7 @@ from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import StlcError
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 Make = Callable[..., System]
@@ -100,7 +100,7 @@ def test_the_policy_sees_components(arm: System) -> None:
 def test_a_specification_names_the_vector(arm: System) -> None:
     text = "signal q: real[2] [rad]\nrequire small: always[0, T] norm(q) < 3\n"
     compiled = compile_spec(
-        parse(Source("a.stl", text)), grid=Grid(arm.decl.dt, arm.horizon), interface=arm.interface()
+        Spec.parse(Source("a.stl", text)), grid=Grid(arm.decl.dt, arm.horizon), interface=arm.interface()
     )
     assert compiled.signature.names == ("q[0]", "q[1]")
 
@@ -131,7 +131,7 @@ def test_what_does_not_go_together_is_said(old: str, new: str, code: str) -> Non
 
 
 def test_a_name_that_is_not_declared_is_shown_as_a_vector(arm: System) -> None:
-    spec = parse(Source("a.stl", "require small: always[0, T] norm(q) < 3\n"))
+    spec = Spec.parse(Source("a.stl", "require small: always[0, T] norm(q) < 3\n"))
     with pytest.raises(StlcError) as caught:
         compile_spec(spec, grid=Grid(arm.decl.dt, arm.horizon), interface=arm.interface())
     assert "`signal q: real[2] [rad]`" in caught.value.diagnostics[0].help[0]

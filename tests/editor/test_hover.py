@@ -6,7 +6,7 @@ from stlc.compile.ir.functions import callable_names
 from stlc.editor.hover import hover
 from stlc.editor.vocabulary import BUILT_IN, FUNCTIONS, KEYWORDS, TEMPORAL
 from stlc.grammar import words
-from stlc.grammar.words import BINARY_TEMPORAL, RESERVED, UNARY_TEMPORAL
+from stlc.grammar.words import OPERATORS, RESERVED
 
 
 def say(document, needle: str, inside: int = 0) -> str:
@@ -116,9 +116,9 @@ def test_an_unfinished_text_still_explains(write):
 
 
 def test_every_word_has_a_sentence():
-    plain = set(RESERVED) - {*UNARY_TEMPORAL, *BINARY_TEMPORAL}
+    plain = set(RESERVED) - OPERATORS.keys()
     trivial = {"and", "or", "iff", "implies", "then", "else", "true", "false"}
     assert plain - trivial <= KEYWORDS.keys()
-    assert {*UNARY_TEMPORAL.values(), *BINARY_TEMPORAL.values()} == TEMPORAL.keys()
+    assert {each.name for each in OPERATORS.values()} == TEMPORAL.keys()
     assert {*callable_names()} <= FUNCTIONS.keys()
     assert words.BUILT_IN.keys() == BUILT_IN.keys()

@@ -10,7 +10,7 @@ from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import SpecError
 from stlc.editor.document import Systems, analyse
 from stlc.editor.rename import RenameError, can_rename, rename
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.lint.lint import edited
 from stlc.source import Source
 
@@ -114,7 +114,7 @@ def formulas(text: str) -> list[object]:
     """Compiled text: formulas over columns, or the codes of its findings."""
     grid = Grid(Fraction(1, 10), 20)
     try:
-        compiled = compile_spec(parse(Source("t.stl", text)), grid=grid, purpose="check")
+        compiled = compile_spec(Spec.parse(Source("t.stl", text)), grid=grid, purpose="check")
     except SpecError as error:
         return [finding.code for finding in error.diagnostics]
     return [rule.formula for rule in compiled.requirements]

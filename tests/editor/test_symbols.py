@@ -3,14 +3,14 @@ from __future__ import annotations
 import pytest
 
 from stlc.editor.symbols import inside, names_of
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source, Span
 
 
 def table(text: str) -> list[str]:
     """`use -> declaration` by line and column, in the order of the text."""
     source = Source("t.stl", text)
-    uses = [one for one in names_of(parse(source)).occurrences if not one.declares]
+    uses = [one for one in names_of(Spec.parse(source)).occurrences if not one.declares]
     return [f"{one.span.text} {place(one.span)} -> {place(one.symbol.span)}" for one in uses]
 
 
@@ -73,18 +73,18 @@ def test_the_first_declaration_has_the_name():
 @pytest.mark.parametrize(("place", "wanted"), [("d)", ["p", "d"]), ("x <", ["p", "d"]), ("require", [])])
 def test_what_can_be_used_inside(place, wanted):
     text = "signal x\ndef f(p, d) = x < p + d\nrequire r: f(1, 2)"
-    assert [symbol.name for symbol in inside(parse(Source("t", text)), text.index(place))] == wanted
+    assert [symbol.name for symbol in inside(Spec.parse(Source("t", text)), text.index(place))] == wanted
 
 
 def test_a_variable_inside_of_its_quantifier():
     text = "signal q : real[3]\nrequire r: forall i in 0..2: q[i] > 0"
-    spec = parse(Source("t", text))
+    spec = Spec.parse(Source("t", text))
     assert [symbol.name for symbol in inside(spec, text.index("q[i]"))] == ["i"]
 
 
 def test_what_a_cursor_touches():
     text = "signal x\nrequire r: x>0"
-    names = names_of(parse(Source("t", text)))
+    names = names_of(Spec.parse(Source("t", text)))
     assert [names.at(offset) is not None for offset in (0, 7, 8, 20, 21, 22)] == [
         False,
         True,

@@ -10,7 +10,7 @@ from typing import Any
 
 from helpers.tools import load_tool
 
-from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, RESERVED, UNARY_TEMPORAL
+from stlc.grammar.words import DECLARATIONS, OPERATORS, RESERVED
 from stlc.units import Unit
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -119,7 +119,7 @@ def test_every_reserved_word_is_coloured():
     wanted = {
         **dict.fromkeys(RESERVED, "keyword.operator.word"),
         **dict.fromkeys(("true", "false", "inf"), "constant.language"),
-        **dict.fromkeys((*UNARY_TEMPORAL, *BINARY_TEMPORAL), "keyword.operator.temporal"),
+        **dict.fromkeys(OPERATORS, "keyword.operator.temporal"),
         **dict.fromkeys(DECLARATIONS, "keyword.declaration"),
     }
     assert {word: colours(f"x {word} (y)")[word] for word in RESERVED} == {

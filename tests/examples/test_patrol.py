@@ -17,7 +17,7 @@ from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.loop import train
 from stlc.dynamics.system import System
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.monitor.verdict import Monitor
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -26,7 +26,7 @@ SPEC = ROOT / "specs" / "patrol.stl"
 
 @pytest.fixture(scope="module")
 def task() -> Task:
-    return Task.of(parse(File(SPEC).read()), System.load(ROOT / "examples" / "unicycle.yaml"))
+    return Task.of(Spec.parse(File(SPEC).read()), System.load(ROOT / "examples" / "unicycle.yaml"))
 
 
 def test_what_became_of_time(task: Task, request: pytest.FixtureRequest) -> None:
@@ -71,7 +71,7 @@ def test_a_trained_policy_fulfils_the_mission(task: Task, tmp_path: Path, guard:
     found = deploy(task, policy, Setting(tuple(range(10)), 10, 260), guard)  # type: ignore[arg-type]
     assert found.metrics["executed"].mean >= share
     states = found.recording.states
-    monitor = Monitor(parse(File(SPEC).read()), dt=0.1, horizon=5)
+    monitor = Monitor(Spec.parse(File(SPEC).read()), dt=0.1, horizon=5)
     verdict = monitor.check({name: states[..., i] for i, name in enumerate(task.system.names)})
     good = np.logical_and.reduce([judgement.holds.all(0) for judgement in verdict.requirements])
     assert good.shape == (100,)

@@ -13,14 +13,14 @@ from stlc.controller.problem.task import Task
 from stlc.dynamics.model.feedback import growth_of
 from stlc.dynamics.system import System
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 
 TASKS = Path(__file__).parents[2] / "examples" / "tasks"
 PLANTS = ("cart_pole", "quadrotor_rates", "quadrotor_rotors", "thermostat", "watch")
 
 
 def task(name: str) -> Task:
-    return Task.of(parse(File(TASKS / f"{name}.stl").read()), System.load(TASKS / f"{name}.yaml"))
+    return Task.of(Spec.parse(File(TASKS / f"{name}.stl").read()), System.load(TASKS / f"{name}.yaml"))
 
 
 @pytest.mark.parametrize("name", PLANTS)

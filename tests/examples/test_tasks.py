@@ -19,7 +19,7 @@ from stlc.controller.problem.task import Task
 from stlc.controller.run.run import Run
 from stlc.dynamics.system import System
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.lint.lint import lint
 from stlc.monitor.verdict import Monitor
 from stlc.rundir import RunDir
@@ -34,7 +34,7 @@ DRIVES, ENOUGH, AGREEMENT = 200, 0.95, 0.05
 
 
 def task(name: str) -> Task:
-    return Task.of(parse(File(TASKS / f"{name}.stl").read()), System.load(TASKS / f"{name}.yaml"))
+    return Task.of(Spec.parse(File(TASKS / f"{name}.stl").read()), System.load(TASKS / f"{name}.yaml"))
 
 
 def test_every_task_has_a_system_a_plan_and_a_row() -> None:
@@ -60,7 +60,7 @@ def test_a_known_plan_satisfies_the_task(name: str) -> None:
     low, high = found.system.control_low - 1e-6, found.system.control_high + 1e-6
     assert bool(((controls >= low) & (controls <= high)).all())
     path = found.rollout(x0[None], controls[None])[0].numpy()
-    spec = parse(File(TASKS / f"{name}.stl").read())
+    spec = Spec.parse(File(TASKS / f"{name}.stl").read())
     horizon = Fraction(found.system.decl.horizon) * found.system.decl.dt
     monitor = Monitor(spec, dt=found.system.decl.dt, horizon=horizon)
     driven = {column: values[None] for column, values in zip(found.system.names, path.T, strict=True)}

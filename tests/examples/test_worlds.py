@@ -24,7 +24,7 @@ from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.world import Choosing, world_type
 from stlc.dynamics.system import System
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 
 ROOT = Path(__file__).parents[2]
 WORLDS = {
@@ -63,7 +63,7 @@ def task(request: pytest.FixtureRequest) -> Task:
 def task_of(name: str) -> Task:
     spec, _, scenario = name.partition(" ")
     system = System.load(ROOT / "examples" / f"{WORLDS[name]}.yaml", scenario=scenario or None)
-    return Task.of(parse(File(ROOT / "specs" / f"{spec}.stl").read()), system)
+    return Task.of(Spec.parse(File(ROOT / "specs" / f"{spec}.stl").read()), system)
 
 
 def film(task: Task, agents: int, seed: int, steps: int = 40) -> tuple[np.ndarray, Any]:

@@ -18,7 +18,6 @@ from stlc.cli.framework.app import main
 from stlc.compile.backends.c.streams import streams_of
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.lower import lower
 from stlc.compile.ir.simplify import simplify
 from stlc.diagnostics import UsageError
 from stlc.export.monitor import _texts, export_monitor
@@ -101,7 +100,7 @@ X, Y = (typed.Predicate(random_formulas.SPAN, ir.Signal(name), strict=False) for
 )
 def test_random_formulas_under_sanitizers(written, trace) -> None:
     compiled = Monitor("spec s\nsignal x\nsignal y\nsignal z\nrequire r: x + y + z > 0\n", dt=0.1).compiled
-    forms = [simplify(lower(each, random_formulas.GRID, [])) for each in written]
+    forms = [simplify(random_formulas.GRID.lower(each, [])) for each in written]
     rules = [replace(random_formulas.a_rule(form), name=f"r{i}") for i, form in enumerate(forms)]
     asked = Online(compiled, rules, How()).asked
     rules = [each.rule for each in asked if streamed_rule(each, ("x", "y", "z"))]

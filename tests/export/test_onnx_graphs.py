@@ -16,7 +16,6 @@ from stlc.compile.backends.onnx.graph import BATCH, OnnxGraph
 from stlc.compile.backends.onnx.ops import ONNX
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import substitute
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.dynamics.model.rollout import Stepper
 from stlc.dynamics.model.step import ModelStep
@@ -153,7 +152,7 @@ def test_a_step_of_many_parts_is_written_once(substeps: int) -> None:
     lets: list[tuple[str, ir.Num]] = []
     for part in range(substeps):
         rk4 = INTEGRATORS.get("rk4")
-        moved = rk4(lambda at: {"angle": at["speed"], "speed": substitute(pull, at)}, state, 0.1 / substeps)
+        moved = rk4(lambda at: {"angle": at["speed"], "speed": pull.substitute(at)}, state, 0.1 / substeps)
         lets += [(f"{name}#{part}", number) for name, number in moved.items()]
         state = {name: ir.Signal(f"{name}#{part}") for name in moved}
     step = ModelStep(tuple(lets), {name: state[name] for name in ("angle", "speed")})

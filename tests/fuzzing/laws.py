@@ -25,7 +25,7 @@ def laws(source, limit: float, *, one_in: int = 1) -> int:
     from stlc.compile.pipeline import compile_spec
     from stlc.diagnostics import StlcError
     from stlc.grammar.english import sentence
-    from stlc.grammar.parser import parse
+    from stlc.grammar.spec import Spec
     from stlc.lint.lint import Selection, Surroundings, lint
 
     decl = _system()
@@ -35,7 +35,7 @@ def laws(source, limit: float, *, one_in: int = 1) -> int:
         _some(found)
     try:
         with stage("parse", limit):
-            spec = parse(source)
+            spec = Spec.parse(source)
     except StlcError as error:
         _some(error.diagnostics)
         return 3
@@ -65,12 +65,12 @@ def _some(findings) -> None:
 
 def _formatted(spec, source, limit) -> None:
     from stlc.grammar.format.format import format_text
-    from stlc.grammar.parser import parse
+    from stlc.grammar.spec import Spec
     from stlc.source import Source
 
     with stage("format", limit):
         once = Source("once.stl", format_text(source))
-    assert parse(once) == spec, "fmt changed the meaning"
+    assert Spec.parse(once) == spec, "fmt changed the meaning"
     assert format_text(once) == once.text, "fmt is not idempotent"
 
 

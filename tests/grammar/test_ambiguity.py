@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 
 from stlc.grammar.ambiguity import ambiguities
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 
 def parts(text: str, *, implications: bool = False) -> list[tuple[str, str]]:
-    spec = parse(Source("text", f"require r: {text}"))
+    spec = Spec.parse(Source("text", f"require r: {text}"))
     return [(part.span.text, part.kind) for part in ambiguities(spec, implications=implications)]
 
 

@@ -14,9 +14,10 @@ from stlc.diagnostics import SpecError, StlcError
 from stlc.editor.document import Systems, analyse
 from stlc.grammar.errors.unicode import plain_text
 from stlc.grammar.format.format import format_text
-from stlc.grammar.parser import parse, parse_expr
+from stlc.grammar.parser import parse_expr
 from stlc.grammar.printer import show
-from stlc.grammar.scan import lexemes
+from stlc.grammar.scan import Lexeme
+from stlc.grammar.spec import Spec
 from stlc.lint.lint import lint
 from stlc.source import Source
 from stlc.units import Unit
@@ -42,7 +43,7 @@ def parts(text: str) -> str:
     """Run every part of the language on a text; return the codes of its errors, on which they agree."""
     source = Source("t.stl", text)
     try:
-        parse(source)
+        Spec.parse(source)
         codes = set()
     except SpecError as error:
         codes = {one.code for one in error.diagnostics}
@@ -65,7 +66,7 @@ def parts(text: str) -> str:
 
 def places(text: str) -> list[int]:
     """Offsets between two lexemes, and within comments, texts and words."""
-    return sorted({at for lexeme in lexemes(text) for at in (lexeme.start, lexeme.end)} | {2, len(text)})
+    return sorted({at for lexeme in Lexeme.scan(text) for at in (lexeme.start, lexeme.end)} | {2, len(text)})
 
 
 @pytest.mark.parametrize("char", UNSEEN, ids=lambda char: f"U+{ord(char):04X}")
@@ -74,7 +75,7 @@ def test_a_control_is_refused_wherever_it_stands(char):
         if char == "\r" and TEXT[at : at + 1] == "\n":
             continue
         with pytest.raises(SpecError) as caught:
-            parse(Source("t.stl", TEXT[:at] + char + TEXT[at:]))
+            Spec.parse(Source("t.stl", TEXT[:at] + char + TEXT[at:]))
         assert {one.code for one in caught.value.diagnostics} == {"E001"}
         assert caught.value.diagnostics[0].span.start == at
 
@@ -88,7 +89,7 @@ def test_another_space_is_refused_between_words_and_kept_in_comments_and_names(c
         f"{char}## doc\nsignal x",
     ):
         with pytest.raises(SpecError) as caught:
-            parse(Source("t.stl", text))
+            Spec.parse(Source("t.stl", text))
         (finding,) = caught.value.diagnostics
         assert finding.code == "E001"
         assert finding.fix.edits[0][1] == " "
@@ -110,7 +111,7 @@ def test_a_lone_carriage_return_hides_nothing():
 
 
 def test_crlf_is_a_line_break():
-    assert parse(Source("t", TEXT.replace("\n", "\r\n"))) == parse(Source("t", TEXT))
+    assert Spec.parse(Source("t", TEXT.replace("\n", "\r\n"))) == Spec.parse(Source("t", TEXT))
 
 
 @settings(max_examples=15, deadline=None)

@@ -6,12 +6,12 @@ import pytest
 
 from stlc.grammar import ast
 from stlc.grammar.english import REPEATED, Meanings, sentence
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 
 def told(formula: str) -> str:
-    (item,) = parse(Source("text", f"require r: {formula}")).items
+    (item,) = Spec.parse(Source("text", f"require r: {formula}")).items
     assert isinstance(item, ast.Require)
     return sentence(item)
 
@@ -46,7 +46,7 @@ def test_a_sentence(formula, english):
 
 
 def test_definitions_are_followed():
-    spec = parse(
+    spec = Spec.parse(
         Source(
             "text", "const c [m] = 2\nconst d = 3 s\ndef a = b > 1\ndef b = x + c\nrequire r: always[0, d] a"
         )
@@ -65,7 +65,7 @@ def test_definitions_that_many_requirements_share_are_not_told_with_each():
     count = 1200
     chain = "".join(f"def d{i} = not d{i - 1}\n" for i in range(1, count))
     uses = "".join(f"require r{i}: d{count - 1}\n" for i in range(count))
-    spec = parse(Source("text", f"signal x\ndef d0 = x > 0\n{chain}{uses}"))
+    spec = Spec.parse(Source("text", f"signal x\ndef d0 = x > 0\n{chain}{uses}"))
     meanings = Meanings(spec)
     told = [meanings.of(item) for item in spec.items if isinstance(item, ast.Require)]
     assert len(told[0]) == count
@@ -89,5 +89,5 @@ def test_definitions_that_many_requirements_share_are_not_told_with_each():
 )
 def test_what_is_read_once(formula, english):
     head = "import std\nsignal x\ndef calm = x < 3\ndef soon = eventually calm\ndef round = round\n"
-    spec = parse(Source("t", f"{head}require r: {formula}"))
+    spec = Spec.parse(Source("t", f"{head}require r: {formula}"))
     assert Meanings(spec).sentence(spec.items[-1]) == english

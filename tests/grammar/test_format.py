@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from stlc.diagnostics import SpecError
 from stlc.files import File
 from stlc.grammar.format.format import WIDTH, format_text
-from stlc.grammar.parser import parse
 from stlc.grammar.printer import show
+from stlc.grammar.spec import Spec
 from stlc.grammar.tokens import tokenize
 from stlc.source import Source
 
@@ -27,7 +27,7 @@ def formatted(text: str) -> str:
 
 
 def tree(text: str):
-    return parse(Source("text", text))
+    return Spec.parse(Source("text", text))
 
 
 def comments(text: str) -> list[str]:

@@ -8,7 +8,8 @@ import pytest
 
 from stlc.cli.framework.render import render_text
 from stlc.diagnostics import CODES, Fix, SpecError
-from stlc.grammar.parser import MAX_ERRORS, parse, parse_expr
+from stlc.grammar.parser import MAX_ERRORS, parse_expr
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden" / "diagnostics"
@@ -17,7 +18,7 @@ CASES = sorted(GOLDEN.glob("*.stl"))
 
 def findings(text: str, name: str = "specs/spec.stl"):
     with pytest.raises(SpecError) as caught:
-        parse(Source(name, text))
+        Spec.parse(Source(name, text))
     return caught.value.diagnostics
 
 
@@ -58,7 +59,7 @@ def applied(text: str, fix: Fix) -> str:
 
 def count(text: str) -> int:
     try:
-        parse(Source("fixed.stl", text))
+        Spec.parse(Source("fixed.stl", text))
     except SpecError as error:
         return len(error.diagnostics)
     return 0
@@ -129,7 +130,7 @@ def test_an_interval_is_closed_by_nobody_but_its_author(bracket):
     (finding,) = findings("signal v\nrequire a: always[0, T abs(v) <= 1.5")
     assert finding.fix is None
     assert finding.help == ("require a: always[0, T] abs(v) <= 1.5",)
-    parse(Source("s.stl", f"signal v\nrequire a: always[0, T{bracket} abs(v) <= 1.5"))
+    Spec.parse(Source("s.stl", f"signal v\nrequire a: always[0, T{bracket} abs(v) <= 1.5"))
 
 
 @pytest.mark.parametrize(
@@ -205,4 +206,4 @@ def test_words_of_other_tools_have_an_answer(text, code, advice):
     assert any(advice in line for line in finding.help)
     if ":=" in text:
         for line in finding.help:
-            parse(Source("t", line.removeprefix("or, for a part of others:  ")))
+            Spec.parse(Source("t", line.removeprefix("or, for a part of others:  ")))

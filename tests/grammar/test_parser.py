@@ -18,8 +18,8 @@ from stlc.diagnostics import Diagnostic, SpecError
 from stlc.files import File
 from stlc.grammar import ast
 from stlc.grammar.fold import LONG_CHAIN, MAX_DEPTH
-from stlc.grammar.parser import MAX_LEXEMES, MAX_TEXT, parse, parse_expr
-from stlc.grammar.traverse import descendants
+from stlc.grammar.parser import MAX_LEXEMES, MAX_TEXT, parse_expr
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 from stlc.units import Unit
 
@@ -32,18 +32,18 @@ def expr(text: str) -> ast.Expr:
     return parse_expr(Source("text", text))
 
 
-def items(text: str) -> tuple[ast.Item, ...]:
-    return parse(Source("text", text)).items
+def items(text: str) -> tuple[ast.Declaration, ...]:
+    return Spec.parse(Source("text", text)).items
 
 
-def only(text: str) -> ast.Item:
+def only(text: str) -> ast.Declaration:
     (item,) = items(text)
     return item
 
 
 def code(text: str) -> str:
     with pytest.raises(SpecError) as caught:
-        parse(Source("text", text))
+        Spec.parse(Source("text", text))
     return caught.value.diagnostics[0].code
 
 
@@ -61,13 +61,13 @@ TEXTS = [path.read_text(encoding="utf-8") for path in DATA]
 
 @pytest.mark.parametrize("path", DATA, ids=lambda path: path.stem)
 def test_the_six_benchmarks_parse(path):
-    spec = parse(File(path).read())
+    spec = Spec.parse(File(path).read())
     assert spec.name == path.stem
     assert any(isinstance(item, ast.Require) for item in spec.items)
 
 
 def test_the_traffic_spec_is_what_it_says():
-    spec = parse(File(ROOT / "specs" / "traffic.stl").read())
+    spec = Spec.parse(File(ROOT / "specs" / "traffic.stl").read())
     assert (spec.name, spec.system, spec.time_unit) == ("traffic", "../examples/car.yaml", "")
     assert spec.system_span is not None
     assert spec.system_span.text == '"../examples/car.yaml"'
@@ -328,7 +328,7 @@ def test_tags():
 
 
 def test_pragmas_and_imports():
-    spec = parse(
+    spec = Spec.parse(
         Source(
             "t",
             'spec a; system "s.yaml"; time ms;\nimport "lib.stl" as m\nimport std\nrequire r: m.f(x) > 0;',
@@ -409,14 +409,14 @@ def test_a_chain_has_the_value_of_its_operators_from_the_left(signs, count, rand
         expected = SIGNS[{"&&": "and", "|": "or"}.get(sign, sign)](expected, operand)
     tree = expr(text)
     assert value(tree) == expected
-    for node in list(descendants(tree))[:5]:
+    for node in list(tree.walk())[:5]:
         assert value(parse_expr(Source("t", node.span.text))) == value(node)
 
 
 @pytest.mark.parametrize("sign", ["and", "or", "+", "*"])
 def test_a_flat_chain_is_no_nesting(sign):
     long = expr(f" {sign} ".join(["x"] * 1000))
-    assert len([node for node in descendants(long) if isinstance(node, ast.Name)]) == 1000
+    assert len([node for node in long.walk() if isinstance(node, ast.Name)]) == 1000
     inner = "-" * (MAX_DEPTH - LONG_CHAIN - 8) + "x"
     expr(f" {sign} ".join([inner] * 100))
 
@@ -450,7 +450,7 @@ def test_numbers_within_doubles_are_exact():
 
 def test_a_text_is_bounded():
     with pytest.raises(SpecError) as caught:
-        parse(Source("big.stl", " " * (MAX_TEXT + 1)))
+        Spec.parse(Source("big.stl", " " * (MAX_TEXT + 1)))
     assert caught.value.diagnostics[0].code == "E005"
 
 
@@ -459,15 +459,15 @@ def test_a_text_is_bounded():
 def test_a_text_of_endless_words_is_refused_at_once(text, lexemes, least, monkeypatch):
     monkeypatch.setattr("stlc.grammar.parser.MAX_LEXEMES", least)
     endless = text * (3 * least // (2 * lexemes))
-    error, spent = refused(lambda: parse(Source("big.stl", f"require r: {endless} x > 0")), SpecError)
+    error, spent = refused(lambda: Spec.parse(Source("big.stl", f"require r: {endless} x > 0")), SpecError)
     assert [finding.code for finding in error.diagnostics] == ["E005"]
     assert "import" in error.diagnostics[0].help[0]
     assert spent < 6 * least
 
 
 def test_empty_texts():
-    assert parse(Source("empty.stl", "")).items == ()
-    assert parse(Source("comment.stl", "# nothing\n\n;;")).items == ()
+    assert Spec.parse(Source("empty.stl", "")).items == ()
+    assert Spec.parse(Source("comment.stl", "# nothing\n\n;;")).items == ()
 
 
 def test_an_enum_size_and_a_type_size_may_be_large_but_not_endless():
@@ -507,7 +507,7 @@ def mutations(draw: st.DrawFn) -> str:
 @settings(max_examples=18)
 @given(mutations())
 def test_damaged_texts_give_findings_or_trees(text):
-    found = findings(parse, text)
+    found = findings(Spec.parse, text)
     assert found is None or 1 <= len(found) <= 20
     for finding in found or ():
         assert finding.span is not None
@@ -517,7 +517,7 @@ def test_damaged_texts_give_findings_or_trees(text):
 @settings(max_examples=18)
 @given(st.text(max_size=60) | st.lists(st.sampled_from(PIECES), max_size=20).map(" ".join))
 def test_any_text_gives_findings_or_a_tree(text):
-    for read in (parse, parse_expr):
+    for read in (Spec.parse, parse_expr):
         found = findings(read, text)
         assert found is None or found
 

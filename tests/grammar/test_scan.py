@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.grammar.scan import brackets, declaration_starts, lexemes
+from stlc.grammar.scan import Lexeme, brackets, declaration_starts
 
 STARTERS = ("state", "env", "const", "def", "region", "enum", "extern", "spec", "system")
 DATA = sorted((Path(__file__).parent / "data").glob("*.stl"))
@@ -22,7 +22,7 @@ def pieces(text: str) -> list[str]:
 
 @given(st.text())
 def test_lexemes_cover_all_but_blanks_and_comments(text):
-    found = list(lexemes(text))
+    found = list(Lexeme.scan(text))
     assert all(text[lexeme.start : lexeme.end] == lexeme.text for lexeme in found)
     assert all(a.end <= b.start for a, b in pairwise(found))
     if "#" not in text and "//" not in text:
@@ -80,7 +80,7 @@ def test_every_declaration_of_the_benchmarks_is_a_piece(path):
 
 
 def test_an_interval_may_be_closed_by_either_bracket():
-    found = brackets(list(lexemes("always(0, 1] (a] until@[0, 1) b")))
+    found = brackets(list(Lexeme.scan("always(0, 1] (a] until@[0, 1) b")))
     assert [(b.opening.text, b.interval, b.closing and b.closing.text) for b in found] == [
         ("(", True, "]"),
         ("(", False, None),

@@ -21,9 +21,7 @@ from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.defined import defined
-from stlc.compile.ir.lower import lower
 from stlc.compile.ir.simplify import simplify
-from stlc.compile.ir.traverse import leaves, nodes, subexpressions
 from stlc.compile.semantics.switch import StraightThrough
 from stlc.controller.problem.kernel import Adjoint, Kernel, ObjectiveSlopes, Sizes
 from stlc.native import load
@@ -95,7 +93,7 @@ def gathered(
 
 def planned(formula: typed.Formula) -> ir.Formula | None:
     """A formula as it is trained for; None where it looks beyond a plan of `STEPS` steps."""
-    node = simplify(lower(formula, GRID, sink=[]))
+    node = simplify(GRID.lower(formula, sink=[]))
     return node if defined(node, STEPS + 1)[0] else None
 
 
@@ -107,7 +105,7 @@ def planned_formulas(count: int) -> list[ir.Formula]:
 
 def assert_every_kind(rules: Sequence[ir.Formula]) -> None:
     """Require a formula of every kind that training takes."""
-    kinds = {type(node) for rule in rules for node in nodes(rule)}
+    kinds = {type(node) for rule in rules for node in rule.walk()}
     temporal = {ir.Temporal, ir.PastTemporal, ir.Until, ir.Since, ir.Shift, ir.Freeze}
     assert kinds >= temporal | {ir.BoolOp, ir.Predicate}
 
@@ -123,8 +121,8 @@ def choosing(count: int, first: int) -> list[ir.Num]:
 
 
 def _is_folded(num: ir.Num) -> bool:
-    for part in subexpressions(num):
-        constant = all(isinstance(leaf, ir.Const) for leaf in leaves(part))
+    for part in num.subexpressions():
+        constant = all(isinstance(leaf, ir.Const) for leaf in part.leaves())
         if constant and not isinstance(part, ir.Const):
             return False
         if isinstance(part, ir.Indicator | ir.Where) and _decided(part.cond):

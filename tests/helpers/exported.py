@@ -21,7 +21,7 @@ from stlc.dynamics.system import System
 from stlc.export.verify import BUILT
 from stlc.export.write import Exported, export
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 
 ROOT = Path(__file__).parents[2]
 STRICT = ("-Wall", "-Wextra", "-Wshadow", "-pedantic", "-Werror")
@@ -64,7 +64,7 @@ def run_of(spec: str, system: str, folder: Path, *, varied: bool = True) -> Run:
 
 def untrained(spec: Path, system: Path, folder: Path, *, varied: bool = True) -> Run:
     """The same of any two files."""
-    task = Task.of(parse(File(spec).read()), System.load(system))
+    task = Task.of(Spec.parse(File(spec).read()), System.load(system))
     with torch.random.fork_rng():
         torch.manual_seed(3)
         network = PlanNetwork(task, hidden=(16, 16), plans=3, varied=varied).eval()

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
-from stlc.compile.ir.support import reach, uses_end
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source, Span
@@ -187,8 +186,8 @@ def a_rule(formula: ir.Formula) -> CompiledRequirement:
         like,
         formula=formula,
         lowered=formula,
-        reach=reach(formula).future,
+        reach=formula.reach.future,
         windowed=False,
-        uses_end=uses_end(formula),
+        uses_end=formula.uses_end,
         absolute=False,
     )

@@ -17,14 +17,12 @@ from helpers.formula_strategies import GRID, SPAN, formulas
 from helpers.reference import EXTREMA, Interval, Robustness, Trace
 from hypothesis import strategies as st
 
-from stlc.compile.augment.lift import from_first_sample, hoist_absolute
+from stlc.compile.augment.lift import hoist_absolute
 from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.lower import lower
 from stlc.compile.ir.simplify import simplify
-from stlc.compile.ir.traverse import on_clock
 from stlc.compile.semantics.semantics import (
     ArithmeticGeometricMean,
     Exact,
@@ -268,7 +266,7 @@ def check_law(law: Law, draw: Draw, env: dict[str, Any], *, flip: bool) -> None:
     for name, semantics in SEMANTICS.items():
         if name in law.holds:
             same_by_definition(left, right, env, name, folds=law.folds)
-            assert simplify(lower(left, GRID, []), semantics) == simplify(lower(right, GRID, []), semantics)
+            assert simplify(GRID.lower(left, []), semantics) == simplify(GRID.lower(right, []), semantics)
         compiled_as_defined(left, env, name)
 
 
@@ -279,7 +277,7 @@ class OnTheClock(Robustness):
     """The definitions, with absolute operators judged at the start of the mission wherever they stand."""
 
     def at(self, node: Formula, t: int, positive: bool = True) -> Interval | None:
-        return super().at(node, 0 if on_clock(node) else t, positive)
+        return super().at(node, 0 if node.on_clock else t, positive)
 
 
 @st.composite
@@ -312,7 +310,7 @@ def check_clock(draw: Draw, env: dict[str, Any]) -> None:
     for name in ALL:
         for end in ENDS:
             one = defined(mission, env, name, end, OnTheClock)[0]
-            assert one == defined(from_first_sample(mission), env, name, end)[0]
+            assert one == defined(mission.from_first_sample(), env, name, end)[0]
 
 
 # -------------------------------------------------------------------- whole formulas
@@ -353,7 +351,7 @@ def same_by_definition(
 def compiled_as_defined(formula: Formula, env: Mapping[str, np.ndarray], name: str) -> None:
     """Windows cut, strict, and both bounds; where a constant decides the compiler may know more."""
     semantics = SEMANTICS[name]
-    node = simplify(lower(formula, GRID, []), semantics)
+    node = simplify(GRID.lower(formula, []), semantics)
     judged = {
         end: robustness_signal(node, env, ops=NUMPY, semantics=semantics, end=end)[:, 0]  # type: ignore[arg-type]
         for end in ("truncate", "strict", "lower", "upper")

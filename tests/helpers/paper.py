@@ -13,7 +13,7 @@ from scipy.stats import ks_2samp
 from stlc.controller.problem.task import Task
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 ROOT = Path(__file__).parents[2]
@@ -59,7 +59,7 @@ class Benchmark:
         text = _changed(path.read_text(), system)
         loaded = System(parse_system(Source(str(path), text), path))
         written = ROOT / "specs" / f"{self.spec}.stl"
-        return Task.of(parse(Source(written.name, _changed(written.read_text(), spec))), loaded)
+        return Task.of(Spec.parse(Source(written.name, _changed(written.read_text(), spec))), loaded)
 
     def cases(self, seed: int, count: int = COUNT) -> tuple[Array, Array]:
         """Any states and plans, (count, columns) and (count, steps, controls)."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from stlc.controller.problem.task import Task
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 SYSTEM = """
@@ -24,4 +24,4 @@ def task(folder: Path, rules: str) -> Task:
     """Task of a point that moves at up to 1 m/s between 0 and 10 m."""
     (folder / "point.yaml").write_text(SYSTEM)
     spec = f"spec s\nstate signal x [m]\n{rules}\n"
-    return Task.of(parse(Source("s.stl", spec)), System.load(folder / "point.yaml"))
+    return Task.of(Spec.parse(Source("s.stl", spec)), System.load(folder / "point.yaml"))

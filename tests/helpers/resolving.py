@@ -10,7 +10,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.normal_form import condition
 from stlc.diagnostics import Diagnostic, StlcError
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 HEAD = """
@@ -28,7 +28,9 @@ signal mode : Mode
 def spec(
     text: str, interface: Interface | None = None, overrides: Mapping[str, str] | None = None
 ) -> typed.Spec:
-    return resolve(parse(Source("specs/spec.stl", text)), interface=interface, overrides=overrides, sink=[])
+    return resolve(
+        Spec.parse(Source("specs/spec.stl", text)), interface=interface, overrides=overrides, sink=[]
+    )
 
 
 def formula(text: str, before: str = "") -> typed.Formula:
@@ -49,7 +51,7 @@ def margin(text: str, before: str = "") -> ir.Num:
 def findings(text: str, **settings: object) -> list[Diagnostic]:
     sink: list[Diagnostic] = []
     try:
-        resolve(parse(Source("specs/spec.stl", text)), sink=sink, **settings)  # type: ignore[arg-type]
+        resolve(Spec.parse(Source("specs/spec.stl", text)), sink=sink, **settings)  # type: ignore[arg-type]
     except StlcError as error:
         return [*sink, *error.diagnostics]
     return sink

@@ -11,7 +11,7 @@ from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import Task
 from stlc.dynamics.system import System
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 ROOT = Path(__file__).parents[2]
@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 @cache
 def task_of(spec: str, system: str) -> Task:
     files = ROOT / "specs" / f"{spec}.stl", ROOT / "examples" / f"{system}.yaml"
-    return Task.of(parse(File(files[0]).read()), System.load(files[1]))
+    return Task.of(Spec.parse(File(files[0]).read()), System.load(files[1]))
 
 
 def half_seen_task(folder: Path) -> Task:
@@ -46,7 +46,7 @@ policy:
 """
     )
     text = "signal x, y\nrequire r: always[0 s, 1 s] x < 1.2"
-    return Task.of(parse(Source("half_seen.stl", text)), System.load(path))
+    return Task.of(Spec.parse(Source("half_seen.stl", text)), System.load(path))
 
 
 @cache

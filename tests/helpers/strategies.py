@@ -8,6 +8,7 @@ from typing import Any
 from hypothesis import strategies as st
 
 from stlc.grammar import ast
+from stlc.grammar.spec import Spec
 from stlc.source import Source, Span
 
 SPAN: Span = Source("random", "").span(0, 0)
@@ -175,12 +176,12 @@ imports = st.one_of(
 )
 
 
-def _spec(name: str, system: str | None, time_unit: str, *parts: Any) -> ast.Spec:
+def _spec(name: str, system: str | None, time_unit: str, *parts: Any) -> Spec:
     imported, items = parts
-    return ast.Spec(SPAN, name, system, None, time_unit, tuple(imported), tuple(items), source=SPAN.source)
+    return Spec(SPAN, name, system, None, time_unit, tuple(imported), tuple(items), source=SPAN.source)
 
 
-specs: st.SearchStrategy[ast.Spec] = st.builds(
+specs: st.SearchStrategy[Spec] = st.builds(
     _spec,
     st.just("") | names,
     st.none() | texts,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
 from stlc.source import Source
@@ -45,5 +45,5 @@ def walk(names=tuple(CORNERS), text=SPEC):
 
 def judged(trace):
     """(spec, verdict) of a trace."""
-    monitor = Monitor(parse(Source("walk.stl", trace.meta.spec_text)))
+    monitor = Monitor(Spec.parse(Source("walk.stl", trace.meta.spec_text)))
     return monitor.spec, monitor.check(trace)

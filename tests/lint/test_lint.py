@@ -12,7 +12,7 @@ from stlc.diagnostics import UsageError
 from stlc.dynamics.load import load_system_decl
 from stlc.files import File
 from stlc.grammar.format.format import format_text
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.lint.lint import Selection, Surroundings, edited, fix, lint
 from stlc.lint.rules import RULES
 from stlc.source import Source
@@ -126,7 +126,7 @@ def test_a_repair_does_not_change_the_meaning():
     text = SIGNAL + "require r: F[0 s, 1 s] x < 1 m && G[0 s, 1 s] y < 1 m || x => F y > 0 m"
     text = text.replace("|| x =>", "|| x > 2 m =>")
     after, left, count = repaired(text)
-    assert parse(Source("text", after)) == parse(Source("text", text))
+    assert Spec.parse(Source("text", after)) == Spec.parse(Source("text", text))
     assert left == []
     assert count == 8
     assert format_text(Source("text", after)) == format_text(Source("text", text))
@@ -151,7 +151,7 @@ def test_a_repair_that_changes_the_requirement_is_left_to_the_reader():
     assert repaired(text) == (after, ["W311"], 1)
     (finding,) = lint(Source("text", after))
     assert finding.fix is not None
-    assert parse(Source("text", edited(after, finding.fix.edits))) == parse(
+    assert Spec.parse(Source("text", edited(after, finding.fix.edits))) == Spec.parse(
         Source("text", SIGNAL + "require r: always (x < 1 m and y < 1 m)")
     )
     assert not lint(Source("text", edited(after, finding.fix.edits)))

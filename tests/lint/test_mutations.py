@@ -10,8 +10,8 @@ import pytest
 from stlc.diagnostics import SpecError
 from stlc.grammar.english import sentence
 from stlc.grammar.format.format import format_text
-from stlc.grammar.parser import parse
-from stlc.grammar.scan import lexemes
+from stlc.grammar.scan import Lexeme
+from stlc.grammar.spec import Spec
 from stlc.lint.lint import Selection, fix, lint
 from stlc.source import Source
 
@@ -60,7 +60,7 @@ EVERYTHING = Selection(("ALL",))
 def mutated(text: str, source: random.Random) -> str:
     """The text after a few cuts, swaps, repetitions and insertions."""
     for _ in range(source.randint(1, 4)):
-        items = list(lexemes(text))
+        items = list(Lexeme.scan(text))
         if not items:
             return source.choice(PIECES)
         one, other = source.choice(items), source.choice(items)
@@ -89,14 +89,14 @@ def tread(text: str) -> bool:
     errors = [sum(f.severity == "error" for f in some) for some in (found, repaired.findings)]
     assert errors[1] <= errors[0]
     try:
-        spec = parse(source)
+        spec = Spec.parse(source)
     except SpecError:
         return False
     for item in spec.items:
         if hasattr(item, "formula"):
             assert sentence(item)
     once = format_text(source)
-    assert parse(Source("again", once)) == spec
+    assert Spec.parse(Source("again", once)) == spec
     assert format_text(Source("again", once)) == once
     return True
 

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir.holes import partial
-from stlc.compile.ir.lower import lower
 from stlc.compile.ir.simplify import simplify
 from stlc.monitor.explain.report import explain
 from stlc.monitor.online.online import How
@@ -42,7 +41,7 @@ def filled(trace: dict[str, np.ndarray], seed: int) -> dict[str, np.ndarray]:
     share=st.sampled_from([0.05, 0.3, 1.0]),
 )
 def test_bounds_hold_for_every_filling(written, trace, ends, window, seed, share) -> None:
-    formula = simplify(lower(written, random_formulas.GRID, []))
+    formula = simplify(random_formulas.GRID.lower(written, []))
     unknown = holed(trace, seed, share)
     record = Record.of(unknown, NUMPY)
     starts = range(record.samples)

@@ -10,9 +10,7 @@ from hypothesis import strategies as st
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.lower import lower
 from stlc.compile.ir.simplify import simplify
-from stlc.compile.ir.support import history
 from stlc.monitor.values import Ends, Record, bounds, window_bounds
 
 
@@ -24,7 +22,7 @@ from stlc.monitor.values import Ends, Record, bounds, window_bounds
     window=st.integers(0, 6),
 )
 def test_a_window_is_a_record_of_its_own(ends: Ends, written, trace, window) -> None:
-    formula = simplify(lower(written, random_formulas.GRID, []))
+    formula = simplify(random_formulas.GRID.lower(written, []))
     record = Record(trace, NUMPY)
     found = window_bounds(formula, record, range(record.samples), window, ends)
     for k in range(record.samples):
@@ -35,9 +33,9 @@ def test_a_window_is_a_record_of_its_own(ends: Ends, written, trace, window) -> 
 
 def test_readings_of_earlier_samples_are_history() -> None:
     earlier = ir.Predicate(ir.ShiftedSignal("x", -2, clamped=True))
-    assert history(earlier) == 2
+    assert earlier.history == 2
     assert (
-        history(ir.Freeze((("v", ir.ShiftedSignal("x", -3, clamped=True)),), ir.Predicate(ir.FrozenVar("v"))))
+        ir.Freeze((("v", ir.ShiftedSignal("x", -3, clamped=True)),), ir.Predicate(ir.FrozenVar("v"))).history
         == 3
     )
     record = Record({"x": np.arange(8.0)[:, None]}, NUMPY)

@@ -22,7 +22,6 @@ from proof.streamed import drawn
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.traverse import from_now, on_clock
 from stlc.diagnostics import SpecError, TraceError
 from stlc.monitor.explain.causes import CauseNode
 from stlc.monitor.explain.report import Cause, explain
@@ -116,8 +115,8 @@ class _Definition(reference.Robustness):
     """The definition; what is on the mission clock is at every sample what it is at the first one."""
 
     def _at(self, node: typed.Formula, t: int, positive: bool) -> reference.Interval | None:
-        if t and isinstance(node, (typed.Temporal, typed.Until)) and on_clock(node):
-            return self.at(from_now(node), 0, positive)
+        if t and isinstance(node, (typed.Temporal, typed.Until)) and node.on_clock:
+            return self.at(node.from_now(), 0, positive)
         return super()._at(node, t, positive)
 
 

@@ -11,8 +11,8 @@ from proof.language import Constant, Formula, nodes
 from proof.levels import End, Record, ahead
 from proof.written import specification
 
-from stlc.grammar.parser import parse
 from stlc.grammar.printer import show
+from stlc.grammar.spec import Spec
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 
@@ -36,8 +36,8 @@ class Case:
         """Every other one from the text that stlc itself writes."""
         if self.seed % 2:
             return Monitor(self.text, dt=DT, horizon=HORIZON * DT)
-        spec = parse(Source("<case>", self.text))
-        again = parse(Source("<again>", show(spec)))
+        spec = Spec.parse(Source("<case>", self.text))
+        again = Spec.parse(Source("<again>", show(spec)))
         assert again == spec, self
         return Monitor(again, dt=DT, horizon=HORIZON * DT)
 

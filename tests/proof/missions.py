@@ -13,16 +13,13 @@ from helpers.reference import Interval, Trace
 from hypothesis import assume
 
 from stlc.compile.augment.augment import augment
-from stlc.compile.augment.lift import from_first_sample
 from stlc.compile.augment.mission import GoalLeaf
 from stlc.compile.augment.timers import TimerTable
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.lower import lower
 from stlc.compile.ir.simplify import simplify
-from stlc.compile.ir.traverse import absolute, nodes
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import Diagnostic
 
@@ -56,9 +53,9 @@ def _planned(formula: typed.Formula, columns: Mapping[str, np.ndarray]) -> np.nd
     errors = {finding.code for finding in sink if finding.severity == "error"}
     assume(not errors & {"E312", "E307"})
     assert not errors
-    compiled = simplify(lower(found.formula, GRID, sink))
+    compiled = simplify(GRID.lower(found.formula, sink))
     env = augmented(table.timers, columns)
-    possible = simplify(lower(found.alive, GRID, sink))
+    possible = simplify(GRID.lower(found.alive, sink))
     count = SAMPLES - HORIZON
     margins, alive = (
         np.broadcast_to(each, (count, BATCH))
@@ -72,7 +69,7 @@ def _planned(formula: typed.Formula, columns: Mapping[str, np.ndarray]) -> np.nd
 
 def check_mission(formula: typed.Formula, seed: int) -> None:
     """Every planning window satisfies the rewriting iff the trace satisfies the mission."""
-    assume(absolute(formula))
+    assume(formula.absolute)
     columns = walks(seed, BATCH)
     planned = _planned(formula, columns)
     np.testing.assert_array_equal(planned.all(0), _defined(formula, columns))
@@ -89,7 +86,7 @@ def _endless(formula: typed.Formula) -> bool:
         isinstance(node, (typed.Temporal, typed.Until))
         and node.op not in ("once", "historically", "since")
         and node.interval.hi is None
-        for node in nodes(formula)
+        for node in formula.walk()
     )
 
 
@@ -107,7 +104,7 @@ def check_nested(formula: typed.Formula, seed: int) -> bool:
     assert errors <= {"E307", "E309", "E310", "E312"}, errors
     if errors:
         return False
-    compiled = simplify(lower(found.formula, GRID, sink))
+    compiled = simplify(GRID.lower(found.formula, sink))
     env = augmented(table.timers, columns)
     starts = LONG - HORIZON
     plans = {
@@ -146,7 +143,7 @@ def _formula(formula: typed.Formula, table: TimerTable) -> ir.Formula:
     sink: list[Diagnostic] = []
     found = augment(requirement(formula), GRID, table, sink)
     assert not [finding for finding in sink if finding.severity == "error"]
-    return simplify(lower(found.formula, GRID, sink))
+    return simplify(GRID.lower(found.formula, sink))
 
 
 def check_margins(formula: typed.Formula, seed: int) -> None:
@@ -171,10 +168,10 @@ def check_margins(formula: typed.Formula, seed: int) -> None:
 
 def check_recorded(formula: typed.Formula, seed: int) -> None:
     """The robustness of a recorded mission, and its bounds where it goes on."""
-    assume(absolute(formula))
+    assume(formula.absolute)
     sink: list[Diagnostic] = []
     cut = {name: column[: 1 + seed % SAMPLES] for name, column in walks(seed, BATCH).items()}
-    compiled = simplify(lower(from_first_sample(formula), GRID, sink))
+    compiled = simplify(GRID.lower(formula.from_first_sample(), sink))
     ends = {end: evaluate([compiled], cut, ops=NUMPY, end=end)[0] for end in ("truncate", "lower", "upper")}
     judged = {end: np.broadcast_to(values, (1, BATCH))[0] for end, values in ends.items()}
     np.testing.assert_array_equal(judged["truncate"], [low for low, _ in _bounds(formula, cut, "truncate")])

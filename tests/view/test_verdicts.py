@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
 from stlc.source import Source
@@ -198,11 +198,11 @@ def test_marks_are_in_the_units_of_the_trace_and_name_the_deciding_sample():
     trace = Trace(
         Signature((column,)), 1.0, {"x": np.array([[500.0, 300.0, 20.0, 79.0, 500.0, 500.0, 500.0]])}
     )
-    verdict = Monitor(parse(Source("s.stl", text))).check(trace)
+    verdict = Monitor(Spec.parse(Source("s.stl", text))).check(trace)
     assert marks_of(verdict, trace).thresholds == {"x": pytest.approx([400.0, 80.0])}
     assert not marks_of(verdict, trace).deciding  # it comes back in time
     trace.data["x"][0, 4:] = 70.0
-    verdict = Monitor(parse(Source("s.stl", text))).check(trace)
+    verdict = Monitor(Spec.parse(Source("s.stl", text))).check(trace)
     (only,) = marks_of(verdict, trace).deciding
     first, last = only.window
     assert first <= only.sample <= last

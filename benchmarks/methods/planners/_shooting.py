@@ -26,7 +26,6 @@ from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.text import show_number
-from stlc.compile.ir.traverse import leaves, nodes, numbers, subexpressions
 from stlc.compile.namespace import Array, Ops
 from stlc.compile.semantics.kinds.smooth import LogSumExp
 
@@ -159,18 +158,18 @@ class Shooting:
         self._motion, self._switch = motion, Eased(sharpness)
         self._semantics = LogSumExp(smoothing)
         reached = motion.reached()
-        read = {name for each in demands for num in numbers(each.formula) for name in _names(num)}
+        read = {name for each in demands for num in each.formula.numbers() for name in _names(num)}
         needed = motion.needed(read)
         self._lets = [(name, num) for name, num in motion.lets if name in needed]
         self.states = tuple(name for name in motion.step if name in reached & needed)
         moving = {*motion.bounds, *self.states, *(name for name, _ in motion.lets), ir.ELAPSED}
-        initial = {name for each in demands for num in numbers(each.formula) for name in _initial(num)}
+        initial = {name for each in demands for num in each.formula.numbers() for name in _initial(num)}
         self.given = tuple(sorted((needed | initial) - moving))
         used = (*(num for _, num in self._lets), *(motion.step[name] for name in self.states))
-        for num in (*used, *(num for each in demands for num in numbers(each.formula))):
+        for num in (*used, *(num for each in demands for num in each.formula.numbers())):
             _require_smooth(num, reached)
         for each in demands:
-            for node in nodes(each.formula):
+            for node in each.formula.walk():
                 if isinstance(node, ir.Freeze):
                     raise NotSmoothError("`freeze`")
                 if isinstance(node, ir.Predicate) and node.guard and _names(node.num) & reached:
@@ -319,14 +318,14 @@ def _conditions(
 
 def _names(num: ir.Num | ir.Formula) -> set[str]:
     """Names of the signals that an expression reads, except those read at the first sample only."""
-    read = (leaf for leaf in leaves(num) if isinstance(leaf, ir.Signal | ir.ShiftedSignal))
-    return {leaf.name for leaf in read if leaf != ir.at_first(ir.Signal(leaf.name))}
+    read = (leaf for leaf in num.leaves() if isinstance(leaf, ir.Signal | ir.ShiftedSignal))
+    return {leaf.name for leaf in read if leaf != ir.Signal(leaf.name).at_first}
 
 
 def _initial(num: ir.Num) -> set[str]:
     """Names of the signals whose value at the first sample of the plan an expression reads."""
-    read = (leaf for leaf in leaves(num) if isinstance(leaf, ir.ShiftedSignal))
-    return {leaf.name for leaf in read if leaf == ir.at_first(ir.Signal(leaf.name))}
+    read = (leaf for leaf in num.leaves() if isinstance(leaf, ir.ShiftedSignal))
+    return {leaf.name for leaf in read if leaf == ir.Signal(leaf.name).at_first}
 
 
 def _require_smooth(num: ir.Num, reached: frozenset[str]) -> None:
@@ -334,7 +333,7 @@ def _require_smooth(num: ir.Num, reached: frozenset[str]) -> None:
 
     `reached` contains the names of the controls, and of all signals that the controls affect.
     """
-    for part in subexpressions(num):
+    for part in num.subexpressions():
         match part:
             case ir.Op(name) if name in STEPS and _names(part) & reached:
                 raise NotSmoothError(show_number(part))

@@ -16,10 +16,7 @@ import numpy as np
 
 from stlc.assurance.verification.forms import FORMS, Bools, Floats, Forms, spread
 from stlc.compile.backends.array.arith import ArrayProgram
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import map_parts, substitute
-from stlc.compile.ir.traverse import nodes
 from stlc.compile.namespace import Array, Ops
 from stlc.dynamics.declaration.init import InitDecl, Situation
 from stlc.dynamics.declaration.motion import Assign
@@ -100,13 +97,13 @@ class Conditions:
     """The conditions of `where`, over states and over boxes of states."""
 
     def __init__(self, conditions: Sequence[ir.Formula]) -> None:
-        self._truth = ArrayProgram({str(i): ir.Indicator(each) for i, each in enumerate(conditions)})
-        margins = (node.num for each in conditions for node in nodes(each) if isinstance(node, ir.Predicate))
+        self._truth = ArrayProgram({str(i): each.indicator() for i, each in enumerate(conditions)})
+        margins = (atom.num for each in conditions for atom in each.predicates())
         self._margins = ArrayProgram({str(i): num for i, num in enumerate(margins)})
 
     def holds(self, states: Mapping[str, Floats]) -> Bools:
         """True if states meet every condition: name -> (n,) to (n,)."""
-        marks = [np.asarray(mark) > 0.5 for mark in self._truth(states, NUMPY).values()]
+        marks = [np.asarray(mark) > 0.5 for mark in self._truth(states).values()]
         found: Bools = np.logical_and.reduce(np.broadcast_arrays(*marks))
         return found
 
@@ -238,12 +235,12 @@ def _outcomes(assign: Assign, taken: int) -> list[_Outcome]:
         if isinstance(num, ir.Op) and num.name == "uniform":
             first, last = map(extract, num.args)
             axes.append(f"#{taken + len(axes)}")
-            return ir.Op("add", (first, ir.Op("mul", (ir.Op("sub", (last, first)), ir.Signal(axes[-1])))))
+            return first + (last - first) * ir.Signal(axes[-1])
         options = _options(num, assign.name)
         if options is not None:
             drawn.append([(chance, extract(option)) for chance, option in options])
             return ir.Signal(f"?{len(drawn) - 1}")
-        return map_parts(num, extract)
+        return num.map_parts(extract)
 
     num = extract(assign.value)
     found = []
@@ -252,7 +249,7 @@ def _outcomes(assign: Assign, taken: int) -> list[_Outcome]:
         chance = float(np.prod([share for share, _ in outcome]))
         label = "" if not drawn else _label(assign.name, num, [option for _, option in outcome])
         if chance > 0.0:
-            found.append(_Outcome(label, chance, substitute(num, table), tuple(axes)))
+            found.append(_Outcome(label, chance, num.substitute(table), tuple(axes)))
     return found
 
 

@@ -20,7 +20,6 @@ from stlc.compile.backends.array.interval import Intervals
 from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.backends.schedule import Boundary
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import frozen_in, leaves, map_children
 from stlc.compile.semantics.tolerance import TOLERANCE
 
 PROVED = 0.5 * TOLERANCE
@@ -69,22 +68,16 @@ class Judge:
         self._numbers: dict[ir.Num, str] = {}
         self._formulas = [self._named(formula) for formula in formulas]
         self._program = ArrayProgram({name: num for num, name in self._numbers.items()})
-        self._read = frozenset(
-            leaf.name
-            for formula in self._formulas
-            for leaf in leaves(formula)
-            if isinstance(leaf, (ir.Signal, ir.ShiftedSignal))
-        )
+        self._read = frozenset(name for formula in self._formulas for name, *_ in formula.reads())
 
     def _named(self, formula: ir.Formula) -> ir.Formula:
         """The formula with a signal for the number of each predicate that is evaluated over forms."""
         if isinstance(formula, ir.Predicate):
-            shifted = any(isinstance(leaf, ir.ShiftedSignal) for leaf in leaves(formula))
-            if frozen_in(formula.num) or (shifted and not self._shifts):
+            if formula.frozen or (formula.shifted and not self._shifts):
                 return formula
             name = self._numbers.setdefault(formula.num, _NAME.format(len(self._numbers)))
             return replace(formula, num=ir.Signal(name))
-        found: ir.Formula = map_children(formula, formulas=self._named)
+        found: ir.Formula = formula.map_children(formulas=self._named)
         return found
 
     def __call__(self, history: Mapping[str, Sequence[Forms]], symbols: int) -> BoxVerdicts:

@@ -14,7 +14,6 @@ from stlc.assurance.verification.forms import FORMS, Bools, Floats, Forms, in_us
 from stlc.assurance.verification.network import UNIT, PlanBounds
 from stlc.assurance.verification.subject import History, Indices, VerificationSubject
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import children
 from stlc.controller.policies.policy import BestOfKPolicy, Policy
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import usage
@@ -165,6 +164,6 @@ def _as_direction(name: str, decl: SystemDecl) -> bool:
         part = stack.pop()
         if part == read:
             return False
-        if part not in (ir.Op("sin", (read,)), ir.Op("cos", (read,))):
-            stack.extend(children(part))
+        if part not in (read.apply("sin"), read.apply("cos")):
+            stack.extend(part.children)
     return True

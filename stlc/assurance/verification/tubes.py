@@ -27,8 +27,6 @@ from stlc.assurance.verification.judged import Judge
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.interval import Intervals
 from stlc.compile.backends.array.interval_ops import INTERVALS
-from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import numbers, subexpressions
 from stlc.diagnostics import usage
 from stlc.dynamics.declaration.perturbable import perturbable
 from stlc.dynamics.model.rollout import Stepper
@@ -335,12 +333,11 @@ class _Motion:
 
 def _refuse_functions(motion: _Motion, task: Task) -> None:
     """Refuse Python functions, whose values have no bounds. Raises UsageError (U101)."""
-    formulas = (num for rule in task.rules for num in numbers(rule.formula))
-    for num in (*motion.numbers.values(), *formulas):
-        for part in subexpressions(num):
-            if isinstance(part, ir.Extern) and not isinstance(part.function, ir.Body):
+    for each in (*motion.numbers.values(), *(rule.formula for rule in task.rules)):
+        for call in each.calls():
+            if call.opaque:
                 raise usage(
-                    f"`{part.name}` is a Python function, whose values have no bounds: there is no tube"
+                    f"`{call.name}` is a Python function, whose values have no bounds: there is no tube"
                 )
 
 

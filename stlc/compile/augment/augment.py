@@ -22,9 +22,8 @@ from stlc.compile.augment.past import Past
 from stlc.compile.augment.timers import Timer, TimerTable, cited, tolerant
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.discretize import Grid, to_window
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.normal_form import condition, normal
-from stlc.compile.ir.traverse import absolute, is_state, looks_back, timer_form
 from stlc.diagnostics import Diagnostic, tell
 from stlc.source import Span
 
@@ -68,10 +67,10 @@ def augment(
     """
     formula = requirement.formula
     always = typed.Truth(formula.span, True)
-    if not absolute(formula) and not looks_back(formula):
+    if not formula.absolute and not formula.looks_back:
         return Augmented(formula, always, None)
     past = Past(grid, table, sink, requirement.name)
-    if not absolute(formula):
+    if not formula.absolute:
         return Augmented(past.rewrite(normal(formula)), always, None)
     if grid.steps is None:
         reason = "an absolute interval is planned for window by window, and no planning horizon is known here"
@@ -112,16 +111,16 @@ class _Goals:
         relative time and mission time are equal. E310 or E312 is appended to `sink` for a formula that is not
         supported.
         """
-        if is_state(node, augmented=True):
+        if node.is_state(augmented=True):
             return self._leaf(node, "always", ir.Window(0, 0), (typed.Truth(node.span, True), node))
         match node:
             case typed.Logic(span, "and" | "or" as op, items):
                 return GoalBranch(op, tuple(map(self.of, items)), span)
             case typed.Temporal(_, "always" | "eventually" as op, interval, body):
-                window = to_window(interval, self.grid, self.sink, outward=op == "always")
+                window = self.grid.window(interval, self.sink, outward=op == "always")
                 return self._leaf(node, op, window, (typed.Truth(node.span, True), body))
             case typed.Until(_, "until" | "release" as op, interval, left, right):
-                window = to_window(interval, self.grid, self.sink, outward=op == "release")
+                window = self.grid.window(interval, self.sink, outward=op == "release")
                 return self._leaf(node, op, window, (left, right))
             case _:
                 tell(self.sink, _looks_ahead(node.span))
@@ -140,12 +139,12 @@ class _Goals:
             asked = Absolute(op, window, node.span, *operands, truth, truth, truth)
             return GoalLeaf(asked, None, self.table.clock(last))
         for body in operands:
-            if not is_state(body, augmented=True):
+            if not body.is_state(augmented=True):
                 tell(self.sink, _looks_ahead(body.span))
                 return self.of(typed.Truth(node.span, True))
         if window.hi is None and op in ("eventually", "until"):
             tell(self.sink, _without_deadline(node.span))
-        left, right = (condition(timer_form(body), flat=True) for body in operands)
+        left, right = (condition(body.timer_form(), flat=True) for body in operands)
         formula = Absolute(op, window, node.span, *operands, tolerant(left), tolerant(right), right)
         clock = self.table.clock(last)
         draft = Timer(self.name, "status", 0.0, ir.Const(0.0), -1.0, 1.0, _about(formula))

@@ -64,8 +64,8 @@ def _guidance(goal: Goal) -> _Guidance | None:
                 return None
             if op == "and":
                 whole = _first_due(costs)
-                most = reduce(lambda a, b: ir.Op("max", (a, b)), [cost.left for cost in costs])
-                return _Guidance(whole.gap, ir.Where(_is_lost(most), ir.Const(_LOST), whole.left))
+                most = reduce(lambda a, b: a.apply("max", b), [cost.left for cost in costs])
+                return _Guidance(whole.gap, _is_lost(most).select(_LOST, whole.left))
             return reduce(_nearer, costs)
         case _:
             assert_never(goal)
@@ -89,13 +89,13 @@ def _leaf(leaf: GoalLeaf) -> _Guidance | None:
     margin = _margin(formula.margin)
     if margin is None:
         return None
-    left = ir.Op("sub", (ir.Const(float(due)), leaf.clock))
-    open_ = at_least(ir.Const(0.5), ir.Op("abs", (leaf.status,)))
-    waiting = open_ if promise else ir.BoolOp("and", (open_, at_least(left, ir.Const(1.0))))
+    left = ir.Const(float(due)) - leaf.clock
+    open_ = at_least(ir.Const(0.5), leaf.status.apply("abs"))
+    waiting = open_ if promise else open_ & at_least(left, ir.Const(1.0))
     lost = at_least(ir.Const(-0.5), leaf.status)
-    gap = ir.Op("relu", (ir.Op("neg", (margin,)),))
-    over = ir.Where(lost, ir.Const(_LOST), ir.Const(_DONE))
-    return _Guidance(ir.Where(waiting, gap, _ZERO), ir.Where(waiting, left, over))
+    gap = (-margin).apply("relu")
+    over = lost.select(_LOST, _DONE)
+    return _Guidance(waiting.select(gap, _ZERO), waiting.select(left, over))
 
 
 def _recurring(leaf: GoalLeaf) -> _Guidance | None:
@@ -131,11 +131,11 @@ def _recurring_part(part: ir.Formula, leaf: GoalLeaf, status: ir.Signal) -> _Gui
     margin = _margin(part)
     if margin is None or len(tests) != 1:
         return None
-    begins = ir.Op("sub", (ir.Const(float(leaf.formula.window.lo)), leaf.clock))
-    left = ir.Op("max", (begins, tests[0]))
+    begins = ir.Const(float(leaf.formula.window.lo)) - leaf.clock
+    left = begins.apply("max", tests[0])
     lost = at_least(ir.Const(-0.5), status)
-    gap = ir.Op("relu", (ir.Op("neg", (margin,)),))
-    return _Guidance(ir.Where(lost, _ZERO, gap), ir.Where(lost, ir.Const(_LOST), left))
+    gap = (-margin).apply("relu")
+    return _Guidance(lost.select(_ZERO, gap), lost.select(_LOST, left))
 
 
 def _first_due(costs: Sequence[_Guidance]) -> _Guidance:
@@ -146,9 +146,9 @@ def _first_due(costs: Sequence[_Guidance]) -> _Guidance:
     """
     if len(costs) == 1:
         return costs[0]
-    first = reduce(lambda a, b: ir.Op("min", (a, b)), [cost.left for cost in costs])
-    gaps: list[ir.Num] = [ir.Where(at_least(first, cost.left), cost.gap, _ZERO) for cost in costs]
-    return _Guidance(reduce(lambda a, b: ir.Op("add", (a, b)), gaps), first)
+    first = reduce(lambda a, b: a.apply("min", b), [cost.left for cost in costs])
+    gaps: list[ir.Num] = [at_least(first, cost.left).select(cost.gap, _ZERO) for cost in costs]
+    return _Guidance(reduce(lambda a, b: a + b, gaps), first)
 
 
 def _nearer(one: _Guidance, other: _Guidance) -> _Guidance:
@@ -157,14 +157,8 @@ def _nearer(one: _Guidance, other: _Guidance) -> _Guidance:
     The result is `one` or `other`, whichever has the smaller violation. A goal that can no longer be met is
     passed over; a goal that is already met has the violation 0.
     """
-    first = ir.BoolOp(
-        "or",
-        (
-            _is_lost(other.left),
-            ir.BoolOp("and", (at_least(_LATEST, one.left), at_least(other.gap, one.gap))),
-        ),
-    )
-    return _Guidance(ir.Where(first, one.gap, other.gap), ir.Where(first, one.left, other.left))
+    first = _is_lost(other.left) | (at_least(_LATEST, one.left) & at_least(other.gap, one.gap))
+    return _Guidance(first.select(one.gap, other.gap), first.select(one.left, other.left))
 
 
 def _is_lost(left: ir.Num) -> ir.Formula:
@@ -180,10 +174,10 @@ def _margin(formula: ir.Formula) -> ir.Num | None:
         case ir.Predicate(_, _, _, True) | ir.Truth():
             return None
         case ir.Predicate(num, sign):
-            return num if sign > 0 else ir.Op("neg", (num,))
+            return num if sign > 0 else -num
         case ir.BoolOp(op, items):
             parts = [part for item in items if (part := _margin(item)) is not None]
             name = "min" if op == "and" else "max"
-            return reduce(lambda a, b: ir.Op(name, (a, b)), parts) if parts else None
+            return reduce(lambda a, b: a.apply(name, b), parts) if parts else None
         case _:
             raise TypeError(f"not a state formula: {formula!r}")

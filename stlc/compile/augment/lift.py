@@ -12,7 +12,6 @@ from dataclasses import replace
 from typing import Literal
 
 from stlc.compile.ir import typed
-from stlc.compile.ir.traverse import absolute, from_now, map_children, nodes, on_clock, operands
 from stlc.diagnostics import Diagnostic, tell
 
 
@@ -21,18 +20,18 @@ def hoist_absolute(formula: typed.Formula, sink: list[Diagnostic]) -> typed.Form
 
     The formula is in negation normal form. If an operator cannot be moved out, E307 is appended to `sink`.
     """
-    if not absolute(formula):
+    if not formula.absolute:
         return formula
     match formula:
         case typed.Logic(_, "and" | "or"):
-            return map_children(formula, formulas=lambda item: hoist_absolute(item, sink))
-        case typed.Temporal(_, _, interval, body) if absolute(body):
+            return formula.map_children(formulas=lambda item: hoist_absolute(item, sink))
+        case typed.Temporal(_, _, interval, body) if body.absolute:
             # a past window without the present sample may be empty; the body then makes no difference
             has_now = interval.lo == typed.Time() and not interval.lo_open
             if formula.op not in ("always", "eventually") and not has_now:
                 return _stuck(formula, sink)
             return _out_of(formula, hoist_absolute(body, sink), sink)
-        case typed.Temporal() | typed.Until() if not any(map(absolute, operands(formula))):
+        case typed.Temporal() | typed.Until() if not any(each.absolute for each in formula.operands):
             return formula
         case _:
             return _stuck(formula, sink)
@@ -51,7 +50,7 @@ def _out_of(node: typed.Temporal, body: typed.Formula, sink: list[Diagnostic]) -
     if isinstance(body, typed.Logic) and body.op in ("and", "or"):
         fixed = [item for item in body.items if _constant(item)]
         moving = [item for item in body.items if not _constant(item)]
-        if fixed and not any(map(absolute, moving)):
+        if fixed and not any(each.absolute for each in moving):
             rest = moving[0] if len(moving) == 1 else replace(body, items=tuple(moving))
             op: Literal["and", "or"] = body.op
             return typed.Logic(node.span, op, (*fixed, replace(node, body=rest)))
@@ -68,7 +67,7 @@ def _constant(formula: typed.Formula) -> bool:
         case typed.Not(_, body):
             return _constant(body)
         case _:
-            return on_clock(formula)
+            return formula.on_clock
 
 
 def _stuck(outer: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
@@ -76,7 +75,7 @@ def _stuck(outer: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
 
     The result is the formula `true`, a placeholder.
     """
-    inner = next(node for node in nodes(outer) if on_clock(node) and node is not outer)
+    inner = next(node for node in outer.walk() if node.on_clock and node is not outer)
     finding = Diagnostic(
         "E307",
         "an absolute interval under another temporal operator",
@@ -86,18 +85,3 @@ def _stuck(outer: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
     place = f"line {outer.span.line}, column {outer.span.column}"
     tell(sink, finding.with_note(f"the operator around it starts at {place}"))
     return typed.Truth(outer.span, True)
-
-
-def from_first_sample(formula: typed.Formula) -> typed.Formula:
-    """Return the formula of a requirement that is evaluated only at the first sample of a recorded trace.
-
-    At that sample, mission time and relative time are equal, so absolute operators (`always@[a, b]`) become
-    relative ones (`always[a, b]`). This does not apply to absolute operators below another temporal operator,
-    which evaluates them at later samples too. They stay absolute: their interval still counts from the first
-    sample.
-    """
-    if isinstance(formula, (typed.Temporal, typed.Until)):
-        return from_now(formula)
-    if isinstance(formula, (typed.Shift, typed.Edge)):
-        return formula
-    return map_children(formula, formulas=from_first_sample)

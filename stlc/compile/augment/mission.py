@@ -19,7 +19,6 @@ from typing import Literal, TypeAlias, assert_never
 from stlc.compile.augment.timers import FALSE, OPEN, TRUE, at_least, both, choose, time_test
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.normal_form import negate
 from stlc.source import Span
 
 AbsoluteOp: TypeAlias = Literal["always", "eventually", "until", "release"]
@@ -126,7 +125,7 @@ def update(formula: Absolute, clock: ir.Signal) -> Callable[[ir.Signal], ir.Num]
     mission clock (steps since the start of the mission).
     """
     later = _decided(formula, clock)
-    return lambda own: choose(at_least(_KNOWN, ir.Op("abs", (own,))), later, own)
+    return lambda own: choose(at_least(_KNOWN, own.apply("abs")), later, own)
 
 
 def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
@@ -140,14 +139,14 @@ def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
     over = ir.Truth(False) if end is None else at_least(clock, ir.Const(float(end)))
     match formula.op:
         case "always":
-            return choose(both(inside, negate(right)), _FALSE, choose(over, _TRUE, _OPEN))
+            return choose(both(inside, right.negated), _FALSE, choose(over, _TRUE, _OPEN))
         case "eventually":
-            return choose(both(inside, right), _TRUE, choose(negate(over), _OPEN, _FALSE))
+            return choose(both(inside, right), _TRUE, choose(over.negated, _OPEN, _FALSE))
         case "until":
-            met = choose(both(inside, right), _TRUE, choose(negate(over), _OPEN, _FALSE))
-            return choose(negate(left), _FALSE, met)
+            met = choose(both(inside, right), _TRUE, choose(over.negated, _OPEN, _FALSE))
+            return choose(left.negated, _FALSE, met)
         case "release":
-            failed = choose(both(inside, negate(right)), _FALSE, choose(over, _TRUE, _OPEN))
+            failed = choose(both(inside, right.negated), _FALSE, choose(over, _TRUE, _OPEN))
             return choose(left, _TRUE, failed)
         case _:
             assert_never(formula.op)

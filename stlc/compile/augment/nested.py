@@ -23,9 +23,8 @@ from stlc.compile.augment.past import REGISTER, in_steps
 from stlc.compile.augment.timers import TimerTable, time_test
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.discretize import Grid, to_window
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.normal_form import normal
-from stlc.compile.ir.traverse import nodes, operands
 from stlc.diagnostics import Diagnostic
 from stlc.source import Span
 
@@ -46,7 +45,7 @@ class TooFarError(Exception):
 
 def looks_ahead(formula: typed.Formula) -> bool:
     """True if `formula` has a future operator."""
-    return any(map(_forwards, nodes(formula)))
+    return any(map(_forwards, formula.walk()))
 
 
 def _forwards(node: typed.Formula) -> bool:
@@ -82,7 +81,7 @@ def in_past_form(
         case typed.Logic(_, _, items):
             return replace(formula, items=tuple(in_past_form(item, grid, table, sink) for item in items))
         case typed.Temporal(_, "always" | "eventually" as op, interval, body) if looks_ahead(body):
-            window = to_window(interval, grid, sink, outward=op == "always")
+            window = grid.window(interval, sink, outward=op == "always")
             body = _on_grid(body, grid, sink)
             writer = _Writer(table, formula.span, soon=op == "eventually")
             if op == "eventually":
@@ -91,7 +90,7 @@ def in_past_form(
         case typed.Until(_, "until" | "release" as op, interval, left, right) if looks_ahead(
             left
         ) or looks_ahead(right):
-            window = to_window(interval, grid, sink, outward=op == "release")
+            window = grid.window(interval, sink, outward=op == "release")
             left, right = _on_grid(left, grid, sink), _on_grid(right, grid, sink)
             writer = _Writer(table, formula.span, soon=op == "until")
             if op == "until":
@@ -122,10 +121,10 @@ def _on_grid(
         case typed.Not(_, body):
             return replace(formula, body=_on_grid(body, grid, sink, negated=True))
         case typed.Temporal(_, op, interval, body):
-            window = to_window(interval, grid, sink, outward=op in ("always", "historically"))
+            window = grid.window(interval, sink, outward=op in ("always", "historically"))
             return replace(formula, interval=in_steps(window, formula.span), body=_on_grid(body, grid, sink))
         case typed.Until(_, op, interval, left, right):
-            window = to_window(interval, grid, sink, outward=op == "release" or negated)
+            window = grid.window(interval, sink, outward=op == "release" or negated)
             left, right = (_on_grid(part, grid, sink) for part in (left, right))
             return replace(formula, interval=in_steps(window, formula.span), left=left, right=right)
         case _:
@@ -155,7 +154,7 @@ def _ahead(formula: typed.Formula) -> int:
     """
     if isinstance(formula, _OPAQUE):
         return 0
-    inner = max(map(_ahead, operands(formula)), default=0)
+    inner = max(map(_ahead, formula.operands), default=0)
     return inner + _end(formula) if _forwards(formula) else inner  # type: ignore[arg-type]
 
 

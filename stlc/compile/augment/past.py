@@ -31,9 +31,8 @@ from stlc.compile.augment.timers import (
 )
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.discretize import Grid, to_window
-from stlc.compile.ir.normal_form import Sign, condition, flip, negate, normal
-from stlc.compile.ir.traverse import is_state, looks_back, timer_form
+from stlc.compile.ir.discretize import Grid
+from stlc.compile.ir.normal_form import condition, normal
 from stlc.diagnostics import Diagnostic, tell
 from stlc.source import Span
 
@@ -89,8 +88,8 @@ class _Test:
     def _extrapolated(self, side: ir.Num) -> ir.Num:
         if not isinstance(side, ir.Signal):
             return side
-        first = ir.at_first(side)
-        return ir.Op("add", (first, ir.Signal(ir.ELAPSED))) if self.later else first
+        first = side.at_first
+        return first + ir.Signal(ir.ELAPSED) if self.later else first
 
 
 @final
@@ -112,7 +111,7 @@ class Past:
 
     def rewrite(self, formula: typed.Formula) -> typed.Formula:
         """Return `formula`, which is in negation normal form, with its past operators replaced by timers."""
-        if not looks_back(formula):
+        if not formula.looks_back:
             return formula
         match formula:
             case typed.Logic(_, _, items):
@@ -141,7 +140,7 @@ class Past:
         body = self._body(node.body)
         if body is None:
             return typed.Truth(node.span, True)
-        window = to_window(node.interval, self.grid, self.sink, outward=not once)
+        window = self.grid.window(node.interval, self.sink, outward=not once)
         if window.lo:
             recent = ir.Window(0, None if window.hi is None else window.hi - window.lo)
             inner = self._window(replace(node, interval=in_steps(recent, node.span)))
@@ -198,11 +197,11 @@ class Past:
         been true at every sample since then. Windows that end before now are rewritten by `_since_before` and
         `_lasting`.
         """
-        sign: Sign = 1 if positive else -1
-        left, right = self._body(normal(node.left, sign)), self._body(normal(node.right, sign))
+        left = self._body(normal(node.left, 1 if positive else -1))
+        right = self._body(normal(node.right, 1 if positive else -1))
         if left is None or right is None:
             return typed.Truth(node.span, True)
-        window = to_window(node.interval, self.grid, self.sink, outward=not positive)
+        window = self.grid.window(node.interval, self.sink, outward=not positive)
         if window.lo and window.hi is None:
             return self._lasting(node, left, right, window.lo, positive=positive)
         if window.lo and window.hi is not None:
@@ -233,7 +232,7 @@ class Past:
         previous sample; the present sample does not count. If `positive` is False, the test is negated,
         and `left` and `right` are the negations of p and q.
         """
-        held, met = (left, right) if positive else (negate(left), negate(right))
+        held, met = (left, right) if positive else (left.negated, right.negated)
         about = f"{cited(node.right)}, and {cited(node.left)} from there on"
         if most is None:
             draft = self._draft("latch", "since", 0.0, 1.0, f"whether there was {about}")
@@ -255,8 +254,9 @@ class Past:
 
         `rise(p)` holds where p is true and was false at the previous sample; at the first sample it is false.
         """
-        now: Sign = 1 if (node.op == "rise") is positive else -1
-        body, before = self._body(normal(node.body, now)), self._body(normal(node.body, flip(now)))
+        rises = (node.op == "rise") is positive
+        body = self._body(normal(node.body, 1 if rises else -1))
+        before = self._body(normal(node.body, -1 if rises else 1))
         if body is None or before is None:
             return typed.Truth(node.span, True)
         op: _Op = "and" if positive else "or"
@@ -323,19 +323,19 @@ class Past:
         p and q hold. It counts steps while p holds, and is reset when p fails.
         """
         p, q = self._condition(left), self._condition(right)
-        held, met = (p, q) if positive else (negate(p), negate(q))
+        held, met = (p, q) if positive else (p.negated, q.negated)
         from_there = f"{cited(node.right)} with {cited(node.left)} from there on"
         about = f"steps since the first {from_there}, up to {least}"
         draft = self._draft("timer", "lasting", 0.0, float(least), about)
 
         def update(own: ir.Signal) -> ir.Num:
-            running = ir.Where(at_least(own, _ONE), _counted(own, least), choose(met, _ONE, _ZERO))
+            running = at_least(own, _ONE).select(_counted(own, least), choose(met, _ONE, _ZERO))
             return choose(held, running, _ZERO)
 
         age = self.table.add(draft, update)
         span, bound, few = node.span, ir.Const(float(least)), ir.Const(least - 1.0)
-        first, elapsed = ir.at_first(age), ir.Signal(ir.ELAPSED)
-        after = ir.Op("add", (first, elapsed))
+        first, elapsed = age.at_first, ir.Signal(ir.ELAPSED)
+        after = first + elapsed
         throughout = self._throughout(left, span, positive=positive)
         inside = _since_inside(node, left, right, ir.Window(least, None), positive=positive)
         if not positive:
@@ -345,8 +345,8 @@ class Past:
             return typed.Recalled(span, now=now, along=typed.Logic(span, "and", (inside, none)))
         tests = time_test(first, _ONE, span), time_test(after, bound, span)
         memory = typed.Logic(span, "and", (throughout, *tests))
-        missing = ir.Op("min", (ir.Op("sub", (elapsed, bound)), ir.Const(-1.0)))
-        lacks = typed.Predicate(span, ir.Op("mul", (missing, ir.Const(MISSING))), strict=False)
+        missing = (elapsed - bound).apply("min", -1.0)
+        lacks = typed.Predicate(span, missing * MISSING, strict=False)
         now = typed.Logic(span, "and", (left, time_test(age, bound, span)))
         return typed.Recalled(span, now=now, along=typed.Logic(span, "or", (inside, memory, lacks)))
 
@@ -362,7 +362,7 @@ class Past:
         return typed.Temporal(span, "historically" if positive else "once", in_steps(window, span), body)
 
     def _condition(self, body: typed.Formula) -> ir.Formula:
-        return tolerant(condition(timer_form(body), flat=True))
+        return tolerant(condition(body.timer_form(), flat=True))
 
     def _body(self, body: typed.Formula) -> typed.Formula | None:
         """Return `body`, the operand of a past operator, with the past operators inside it rewritten.
@@ -370,7 +370,7 @@ class Past:
         The result is None, with E309 in `sink`, if `body` looks into the future.
         """
         rewritten = self.rewrite(body)
-        if is_state(rewritten, augmented=True):
+        if rewritten.is_state(augmented=True):
             return rewritten
         self._refused(body.span, "over a formula that looks ahead")
         return None
@@ -392,7 +392,7 @@ class Past:
 
 def _counted(own: ir.Num, most: int) -> ir.Num:
     """Return the number `own + 1`, but at most `most`."""
-    return ir.Op("min", (ir.Op("add", (own, _ONE)), ir.Const(float(most))))
+    return (own + _ONE).apply("min", float(most))
 
 
 def in_steps(window: ir.Window, span: Span, clock: Literal["now", "start"] = "now") -> typed.Interval:

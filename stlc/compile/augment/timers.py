@@ -14,8 +14,6 @@ from typing import Literal, TypeAlias
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.normal_form import joined
-from stlc.compile.ir.traverse import map_children
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.signature import Column
 from stlc.source import Span
@@ -61,7 +59,7 @@ class Timer:
 
 def clock_of(name: str, high: int) -> Timer:
     """Return the mission clock: an added state that counts the steps of the mission up to `high`."""
-    later = ir.Op("min", (ir.Op("add", (ir.Signal(name), ir.Const(1.0))), ir.Const(float(high))))
+    later = (ir.Signal(name) + 1.0).apply("min", float(high))
     return Timer(name, "clock", 0.0, later, 0.0, float(high), "counts the samples of the mission")
 
 
@@ -114,7 +112,7 @@ class TimerTable:
 
 def at_least(left: ir.Num, right: ir.Num) -> ir.Predicate:
     """Return the predicate `left >= right` between integers."""
-    return ir.Predicate(ir.Op("sub", (left, right)))
+    return ir.Predicate(left - right)
 
 
 def time_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Predicate:
@@ -122,7 +120,7 @@ def time_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Predicate:
 
     Its robustness is +inf or -inf. So it decides whether an enclosing formula holds, but not by how much.
     """
-    return typed.Predicate(span, ir.Op("sub", (left, right)), strict=False, guard=True)
+    return typed.Predicate(span, left - right, strict=False, guard=True)
 
 
 def timer_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Formula:
@@ -133,7 +131,7 @@ def timer_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Formula:
     predicate. So in an `or` or `eventually`, whose robustness is a maximum, the operands that the plan can
     influence decide. The robustness is finite, so that plans that all fail can still be ranked.
     """
-    gap = ir.Op("mul", (ir.Op("sub", (left, right)), ir.Const(MISSING)))
+    gap = (left - right) * MISSING
     return typed.Logic(span, "or", (time_test(left, right, span), typed.Predicate(span, gap, strict=False)))
 
 
@@ -141,7 +139,7 @@ def choose(condition: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
     """Return the number that is `yes` where a state formula holds, else `no`."""
     if isinstance(condition, ir.Truth):
         return yes if condition.value else no
-    return ir.Where(condition, yes, no)
+    return condition.select(yes, no)
 
 
 def tolerant(formula: ir.Formula) -> ir.Formula:
@@ -150,13 +148,13 @@ def tolerant(formula: ir.Formula) -> ir.Formula:
     The monitor accepts a predicate that misses its threshold by at most `TOLERANCE`.
     """
     if isinstance(formula, ir.Predicate) and not formula.guard:
-        return ir.Predicate(ir.Op("add", (formula.num, ir.Const(formula.sign * TOLERANCE))), formula.sign)
-    return map_children(formula, formulas=tolerant)
+        return ir.Predicate(formula.num + (formula.sign * TOLERANCE), formula.sign)
+    return formula.map_children(formulas=tolerant)
 
 
 def both(*items: ir.Formula) -> ir.Formula:
     """Return the conjunction of formulas, simplified where a formula is a constant."""
-    return joined("and", items)
+    return ir.BoolOp.joined("and", items)
 
 
 def cited(formula: typed.Formula) -> str:

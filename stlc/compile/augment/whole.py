@@ -13,7 +13,6 @@ from fractions import Fraction
 
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
-from stlc.compile.ir.traverse import absolute, mentions_horizon
 
 
 def over_mission(formula: typed.Formula, grid: Grid) -> typed.Formula:
@@ -21,10 +20,10 @@ def over_mission(formula: typed.Formula, grid: Grid) -> typed.Formula:
 
     The mission has `grid.end` steps. Requirements with absolute operators are returned unchanged.
     """
-    if absolute(formula):
+    if formula.absolute:
         return formula
     end = typed.Time(steps=Fraction(grid.end or 0))
-    if not mentions_horizon(formula):
+    if not formula.mentions_horizon:
         return _from_start(formula, end)
     return _at_starts(formula, typed.Time(steps=max(end.steps - (grid.horizon or 0), Fraction(0))), end)
 

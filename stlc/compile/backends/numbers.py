@@ -57,7 +57,8 @@ class NumberEvaluator(ABC, Generic[V]):
                 return self._indicator(cond, sharpness)
             case ir.Where(cond, yes, no):
                 return self._choice(cond, self.number(yes), self.number(no))
-            case leaf:
+            case _:
+                leaf: Any = num
                 return self._leaf(leaf)
 
     def inlined(self, body: ir.Body, args: Sequence[V]) -> Self:
@@ -101,9 +102,9 @@ def margin_of(formula: ir.Formula, *, guarded: bool = False) -> ir.Num:
     """
     match formula:
         case ir.Predicate(guard=True) if guarded:
-            return ir.Where(formula, ir.Const(math.inf), ir.Const(-math.inf))
+            return formula.select(math.inf, -math.inf)
         case ir.Predicate(num, sign):
-            return num if sign > 0 else ir.Op("neg", (num,))
+            return num if sign > 0 else -num
         case ir.BoolOp(op, items):
             parts = tuple(margin_of(item, guarded=guarded) for item in items)
             return ir.Op("min" if op == "and" else "max", parts)

@@ -15,8 +15,7 @@ from types import MappingProxyType
 from typing import Any, Literal, TypeAlias
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import Reach, farthest, reach_of, tail
-from stlc.compile.ir.traverse import operands as parts_of
+from stlc.compile.ir.support import Offsets, Reach
 from stlc.compile.namespace import Pick
 
 Boundary: TypeAlias = Literal["strict", "truncate", "lower", "upper", "both"]
@@ -190,31 +189,31 @@ def operands(
     predicates and `freeze` have no operands.
     """
     match node:
-        case ir.Truth() | ir.Predicate() | ir.Freeze():
-            return ()
         case ir.AtStart(body):
             return ((body, IndexRange(0, 0)),)
         case ir.BoolOp(_, items):
             return tuple((item, run) for item in items)
-        case _:
-            parts, around = parts_of(node), node.offsets
+        case ir.Operator():
+            parts, around = node.operands, node.offsets
             runs = [
                 IndexRange(_first(read, run), _last(read, run, around[-1], parts, domain)) for read in around
             ]
             runs = runs if runs[-1].count > 0 else [_NEVER] * len(runs)
             return tuple(zip(parts, runs, strict=True))
+        case _:
+            return ()
 
 
 _NEVER = IndexRange(0, -1)
 
 
-def _first(read: ir.Offsets, run: IndexRange) -> Instant:
+def _first(read: Offsets, run: IndexRange) -> Instant:
     """First instant at which a formula with values at the instants `run` reads an operand, by its offsets."""
     return 0 if read.first is None else at_least(run.start + read.first, 0)
 
 
 def _last(
-    read: ir.Offsets, run: IndexRange, window: ir.Offsets, parts: Sequence[ir.Formula], domain: TraceDomain
+    read: Offsets, run: IndexRange, window: Offsets, parts: Sequence[ir.Formula], domain: TraceDomain
 ) -> Instant:
     """Return the last instant at which a formula reads an operand.
 
@@ -238,7 +237,7 @@ def _last(
     far = read.last > 0 and latest(last) >= domain.samples + _FAR
     if not far or domain.counted or read.first == read.last:
         return last
-    tails = [tail(part, domain.samples, domain.length) for part in parts]
+    tails = [part.tail(domain.samples, domain.length) for part in parts]
     known = [found for found in tails if found is not None]
     if len(known) < len(tails):
         return last
@@ -252,8 +251,8 @@ def reads(num: ir.Num, domain: TraceDomain) -> Reach:
     more samples will follow (`domain.stop`, the final length, is given), the last sample is not yet known.
     Then all samples that `num` reads must exist.
     """
-    past, future = reach_of(num)
-    return Reach(past, future if domain.stop is None else max(future, farthest(num).future))
+    past, future = num.reach
+    return Reach(past, future if domain.stop is None else max(future, num.farthest.future))
 
 
 def within(reach: Reach, run: IndexRange, domain: TraceDomain) -> IndexRange:

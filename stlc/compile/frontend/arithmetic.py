@@ -140,7 +140,7 @@ def rebased(number: Number, unit: Unit) -> Number:
         ):
             num = inner
         case inner:
-            num = ir.Op("add" if amount > 0 else "sub", (inner, ir.Const(abs(amount))))
+            num = inner.apply("add" if amount > 0 else "sub", abs(amount))
     return replace(number, num=num, unit=unit, exact=exact, kind="real", sense="")
 
 
@@ -193,7 +193,7 @@ def in_unit(number: Number, unit: Unit, scope: Scope) -> Number:
         return replace(number, unit=unit, bare=False, flexible=False)
     exact = None if number.exact is None else number.exact * unit.ratio
     value = number.constant
-    num: ir.Num = ir.Op("mul", (number.num, ir.Const(unit.scale)))
+    num: ir.Num = number.num * unit.scale
     if value is not None:
         stored = nearest(exact) if exact is not None else value * unit.scale
         if not math.isfinite(stored):
@@ -553,7 +553,7 @@ def _op(name: str, args: Sequence[Number]) -> ir.Num:
         case ("min" | "max" | "choice", (num,)):
             return num
         case "pow", (base, ir.Const(exponent)) if exponent in (0.5, 1.0, 2.0):
-            return base if exponent == 1.0 else ir.Op("sqrt" if exponent == 0.5 else "square", (base,))
+            return base if exponent == 1.0 else base.apply("sqrt" if exponent == 0.5 else "square")
         case _:
             return ir.Op(name, nums)
 
@@ -648,7 +648,7 @@ def _repair(left: Number, right: Number, span: Span) -> tuple[str, ...]:
 def negated(number: Number, span: Span) -> Number:
     """Return the negated number."""
     value = number.constant
-    num: ir.Num = ir.Const(-value) if value is not None else ir.Op("neg", (number.num,))
+    num: ir.Num = ir.Const(-value) if value is not None else -number.num
     exact = None if number.exact is None else -number.exact
     return replace(number, num=num, exact=exact, span=span, origin=None)
 

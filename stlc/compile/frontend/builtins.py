@@ -47,12 +47,12 @@ from stlc.compile.frontend.values import (
     VectorValue,
     literal,
     noun,
+    shifted,
 )
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.discretize import Grid, delay_fault, no_delay
+from stlc.compile.ir.discretize import Grid, no_delay
 from stlc.compile.ir.functions import FUNCTIONS, REGIONS, REWRITTEN, STEPPING
-from stlc.compile.ir.traverse import map_leaves, shifted
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.source import Span
@@ -288,7 +288,7 @@ def _delay(value: Value, expr: ast.Expr, scope: Scope) -> typed.Time:
             message = "`shift` goes a whole number of samples, known at compile time"
             return scope.fail(no_delay(message, expr.span))
     if not (time.seconds or time.horizons):
-        finding = delay_fault(time.steps, expr.span, Grid())
+        finding = Grid().delay_fault(time.steps, expr.span)
         if finding is not None:
             scope.fail(finding)
     return time
@@ -302,18 +302,18 @@ def _before(value: Value, call: ast.Call, scope: Scope) -> Value:
     """
 
     def renamed(leaf: ir.Num) -> ir.Num:
-        return ir.Signal(leaf.name + ir.BEFORE) if isinstance(leaf, ir.Signal) else leaf
+        return leaf.before if isinstance(leaf, ir.Signal) else leaf
 
     match value:
         case Number():
-            formula = None if value.formula is None else map_leaves(value.formula, renamed)
-            return replace(value, num=map_leaves(value.num, renamed), formula=formula, origin=None)
+            formula = None if value.formula is None else value.formula.map_leaves(renamed)
+            return replace(value, num=value.num.map_leaves(renamed), formula=formula, origin=None)
         case VectorValue(items):
             return replace(
-                value, items=tuple(replace(each, num=map_leaves(each.num, renamed)) for each in items)
+                value, items=tuple(replace(each, num=each.num.map_leaves(renamed)) for each in items)
             )
         case _:
-            return map_leaves(as_formula(value, call.args[0].value, Expectation("`prev`"), scope), renamed)
+            return as_formula(value, call.args[0].value, Expectation("`prev`"), scope).map_leaves(renamed)
 
 
 def outside(entry: External, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
@@ -361,7 +361,7 @@ def _argument(number: Number, unit: Unit, need: Expectation, span: Span, scope: 
 def _output(entry: External, index: int, args: tuple[ir.Num, ...]) -> Number:
     num: ir.Num = ir.Extern(entry.name, args, index, entry.function)
     if entry.unit.ratio != 1:
-        num = ir.Op("mul", (num, ir.Const(entry.unit.scale)))
+        num = num * entry.unit.scale
     return Number(num, entry.unit, flexible=not entry.unit.text, kind=entry.kind)
 
 
@@ -502,6 +502,6 @@ def _indicator(call: ast.Call, values: Sequence[Value], scope: Scope) -> Number:
         if sharpness is None or sharpness <= 0:
             scope.fail(Diagnostic("E205", "the sharpness of `ind` is a positive constant", arg.value.span))
     cond = as_state_formula(values[0], call.args[0].value, Expectation("`ind`", "argument 1"), scope)
-    if isinstance(cond, ir.Truth):
-        return replace(literal(int(cond.value), call.span), flexible=False, bare=False)
-    return Number(ir.Indicator(cond, sharpness), kind="int", span=call.span)
+    if cond.constant is not None:
+        return replace(literal(int(cond.constant), call.span), flexible=False, bare=False)
+    return Number(cond.indicator(sharpness), kind="int", span=call.span)

@@ -12,7 +12,6 @@ from stlc.compile.frontend.values import Number, TimeExpr, Value, VectorValue, d
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.normal_form import condition
-from stlc.compile.ir.traverse import is_state
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.signature import Column
@@ -49,7 +48,7 @@ def as_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> 
             return value
         case Member():
             return member_number(value, expr.span, scope)
-        case typed.Node():
+        case typed.Formula():
             return scope.fail(_formula_for_number(value, expr, need))
         case TimeExpr():
             return scope.fail(_time_for_number(value, expr))
@@ -86,7 +85,7 @@ def as_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) ->
         case Number(kind="bool") as number:
             margin = apply("sub", (replace(number, kind="real"), half(expr.span)), expr.span, scope)
             return typed.Predicate(expr.span, margin.num, strict=False)
-        case typed.Node():
+        case typed.Formula():
             return value
         case _:
             return scope.fail(_number_for_formula(value, expr, need))
@@ -101,7 +100,7 @@ def as_state_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Sco
         Failed: the value is not a formula (E201), or its truth depends on several instants (E202).
     """
     formula = as_formula(value, expr, need, scope)
-    if not is_state(formula):
+    if not formula.is_state():
         message = f"{need.who}, but this looks at other times"
         note = ("a temporal operator has no numeric form in a predicate",)
         scope.fail(Diagnostic("E202", message, expr.span, "temporal", note=note))
@@ -168,7 +167,7 @@ def _as_comparison(value: Value, expr: ast.Expr) -> tuple[str, ...]:
 
 def _formula_for_number(value: typed.Formula, expr: ast.Expr, need: Expectation) -> Diagnostic:
     message = f"{need.who}; {need.which} is a formula"
-    if is_state(value):
+    if value.is_state():
         help_ = (f"`ind({expr.span.text})` is 1 where it holds and 0 elsewhere",)
     else:
         help_ = (

@@ -28,6 +28,7 @@ from stlc.compile.frontend.values import Number, TimeExpr, Value, VectorValue
 from stlc.compile.ir.functions import FUNCTIONS, callable_names, sampler_names
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
+from stlc.grammar.spec import Spec
 from stlc.grammar.words import BUILT_IN
 from stlc.signature import Column, Kind, Role
 from stlc.similar import closest
@@ -370,7 +371,7 @@ class Declared:
 
 
 def declare(
-    spec: ast.Spec, interface: Interface | None, overrides: Mapping[str, ast.Expr], scope: Scope
+    spec: Spec, interface: Interface | None, overrides: Mapping[str, ast.Expr], scope: Scope
 ) -> Declared:
     """Return the declarations of a file, and report the errors in them to `scope`.
 
@@ -410,18 +411,18 @@ def declare(
     return found
 
 
-def _keyword(item: ast.Item) -> str:
+def _keyword(item: ast.Declaration) -> str:
     return type(item).__name__.lower()
 
 
-def _check_twice(spec: ast.Spec, scope: Scope) -> None:
+def _check_twice(spec: Spec, scope: Scope) -> None:
     """Report the error E102 for a value, type, requirement or import that is declared twice."""
     spaces: dict[str, dict[str, tuple[Span, str]]] = {"value": {}, "type": {}, "rule": {}, "file": {}}
     for written in spec.imports:
         if written.alias is not None:
             _claim(written.alias, written.span, "", spaces["file"], scope)
     for item in spec.items:
-        space = {ast.Enum: "type", ast.Require: "rule", ast.Assume: "rule"}.get(type(item), "value")
+        space = {"enum": "type", "requirement": "rule", "assumption": "rule"}.get(item.noun, "value")
         _claim(item.name, item.name_span, "", spaces[space], scope)
         if isinstance(item, ast.Enum):
             for name, _ in item.members:
@@ -526,7 +527,7 @@ _ENTRIES: Mapping[type, Callable[[_EntryBuilder, Any], Entry]] = {
 """Class of declarations -> function that returns the entry of a declaration in the name table."""
 
 
-def _about(item: ast.Item) -> str:
+def _about(item: ast.Declaration) -> str:
     return f"{_keyword(item)}, declared at line {item.name_span.line}"
 
 

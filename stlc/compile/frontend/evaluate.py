@@ -39,12 +39,10 @@ from stlc.compile.frontend.values import (
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.functions import OPERATORS as ARITHMETIC
-from stlc.compile.ir.traverse import is_state
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
-from stlc.grammar.traverse import children, descendants
-from stlc.grammar.words import BINARY_TEMPORAL, OPERATORS
+from stlc.grammar.words import OPERATORS
 from stlc.signature import Kind
 from stlc.source import Source, Span
 from stlc.units import Unit, nearest
@@ -91,9 +89,9 @@ def choose(expr: ast.IfThenElse, values: Sequence[Value], scope: Scope) -> Value
     """
     decides, yes, no = values
     cond = as_formula(decides, expr.cond, Expectation("`if`"), scope)
-    if isinstance(yes, typed.Node) or isinstance(no, typed.Node):
+    if isinstance(yes, typed.Formula) or isinstance(no, typed.Formula):
         return _choice_of_formulas(expr, cond, (yes, no), scope)
-    if _is_bool(yes) and _is_bool(no) and not is_state(cond):
+    if _is_bool(yes) and _is_bool(no) and not cond.is_state():
         return _choice_of_formulas(expr, cond, (yes, no), scope)
     if not (isinstance(yes, VectorValue) and isinstance(no, VectorValue)):
         return _choose(expr, cond, (yes, no), scope)
@@ -127,13 +125,13 @@ def _choose(expr: ast.IfThenElse, cond: typed.Formula, branches: tuple[Value, Va
     yes = loose_number(branches[0], expr.yes, need, scope)
     no = loose_number(branches[1], expr.no, need, scope)
     (yes, no), blank = agree((yes, no), "choose between", expr.span, scope)
-    if isinstance(decides, ir.Truth):
-        return yes if decides.value else no
+    if decides.constant is not None:
+        return yes if decides.constant else no
     formula = _choice_of_formulas(expr, cond, branches, scope) if _is_bool(yes) and _is_bool(no) else None
     same = yes.kind == no.kind and yes.labels == no.labels
     kind: Kind = yes.kind if same else "real"
     labels = yes.labels if same else ()
-    num = ir.Where(decides, yes.num, no.num)
+    num = decides.select(yes.num, no.num)
     return replace(blank, num=num, kind=kind, labels=labels, formula=formula)
 
 
@@ -603,7 +601,7 @@ def _expansion(op: str) -> ast.Expr:
     The formula has no intervals. A basic operator such as `until` has no definition in terms of others; for
     it, the formula is `p until q`.
     """
-    plain = f"p {op} q" if op in BINARY_TEMPORAL else f"{op} p"
+    plain = f"p {op} q" if OPERATORS[op].binary else f"{op} p"
     return parse_expr(Source(f"expansion of {op}", OPERATORS[op].expansion or plain))
 
 
@@ -613,7 +611,7 @@ def _repeats_operand(op: str) -> bool:
 
     The result is also True for `unless`, which is expanded at a later stage.
     """
-    names = [node.name for node in descendants(_expansion(op)) if isinstance(node, ast.Name)]
+    names = [node.name for node in _expansion(op).walk() if isinstance(node, ast.Name)]
     return op == "unless" or len(names) > len(set(names))
 
 
@@ -626,7 +624,7 @@ def _timed_node(
     """
     if isinstance(pattern, ast.Name):
         return operands[pattern.name]
-    inner = [_timed_node(part, operands, window, span) for part in children(pattern)]
+    inner = [_timed_node(part, operands, window, span) for part in pattern.children()]
     match pattern:
         case ast.Temporal(op=op):
             return typed.Temporal(span, cast("typed.UnaryTemporal", op), window, *inner)
@@ -723,7 +721,7 @@ def _domain(expr: ast.Quantifier, scope: Scope) -> Iterator[Number]:
 
 
 def _compare(expr: ast.Compare, scope: Scope) -> Value:
-    if any(isinstance(node, ast.Extreme) for node in descendants(expr)):
+    if any(isinstance(node, ast.Extreme) for node in expr.walk()):
         return evaluate(without_extremes(expr, scope, evaluate), scope)
     return comparisons.comparison(expr, evaluate_all(expr.operands, scope), scope)
 

@@ -23,7 +23,6 @@ from stlc.compile.frontend.values import (
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.normal_form import condition
-from stlc.compile.ir.traverse import is_state
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.signature import Column
@@ -59,7 +58,7 @@ def resolve_state_formula(expr: ast.Expr, scope: Scope, *, what: str = "a condit
     """
     with _raising(scope):
         formula = _formula(evaluate(expr, scope), expr, what, scope)
-        if not is_state(formula):
+        if not formula.is_state():
             scope.fail(Diagnostic("E202", f"{what} speaks about one instant", expr.span, "temporal"))
         return condition(formula)
 
@@ -91,7 +90,7 @@ def resolve_formula(expr: ast.Expr, scope: Scope, *, what: str = "a requirement"
 
 
 def _formula(value: Value, expr: ast.Expr, what: str, scope: Scope) -> typed.Formula:
-    fits = isinstance(value, typed.Node) or (isinstance(value, Number) and value.kind == "bool")
+    fits = isinstance(value, typed.Formula) or (isinstance(value, Number) and value.kind == "bool")
     if not fits and not scope.in_spec:
         help_ = (f"`{expr.span.text} > 0`",) if isinstance(value, Number) and not value.labels else ()
         message = f"{what} must be a formula, this is {noun(value)}"
@@ -147,7 +146,7 @@ def stored(number: Number, unit: Unit) -> ir.Num:
         return number.num
     value = number.constant
     if value is None:
-        return ir.Op("div", (number.num, ir.Const(unit.scale)))
+        return number.num / unit.scale
     return ir.Const(nearest(number.exact / unit.ratio) if number.exact is not None else value / unit.scale)
 
 
@@ -160,9 +159,9 @@ def _stored_value(value: Value, expr: ast.Expr, column: Column | None, what: str
     Raises:
         Failed: the value has a type (E202, E205, S203) or unit (E203) that does not fit the column.
     """
-    if column is not None and column.kind == "bool" and isinstance(value, typed.Node) and is_state(value):
+    if column is not None and column.kind == "bool" and isinstance(value, typed.Formula) and value.is_state():
         cond = condition(value)
-        truth = ir.Const(float(cond.value)) if isinstance(cond, ir.Truth) else ir.Indicator(cond)
+        truth = cond.indicator() if cond.constant is None else ir.Const(float(cond.constant))
         return Number(truth, kind="bool", span=expr.span)
     if column is not None and column.labels and isinstance(value, EnumMember):
         known = dict(column.labels)
@@ -171,8 +170,8 @@ def _stored_value(value: Value, expr: ast.Expr, column: Column | None, what: str
             message = f"`{value.name}` is not a member of the enum of `{column.name}`"
             scope.fail(Diagnostic("E205", message, expr.span, help=(f"its members are {names}",)))
         return Number(ir.Const(known[value.name]), kind="enum", labels=column.labels, span=expr.span)
-    if isinstance(value, typed.Node) and not isinstance(value, typed.Truth) and not scope.in_spec:
-        help_ = (f"`ind({expr.span.text})` is 1 where it holds and 0 elsewhere",) if is_state(value) else ()
+    if isinstance(value, typed.Formula) and not isinstance(value, typed.Truth) and not scope.in_spec:
+        help_ = (f"`ind({expr.span.text})` is 1 where it holds and 0 elsewhere",) if value.is_state() else ()
         scope.fail(
             Diagnostic(
                 "S203", f"{what} must be a number, this is a formula", expr.span, "formula", help=help_

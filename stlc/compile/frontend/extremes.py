@@ -21,7 +21,6 @@ from stlc.compile.frontend.values import Number, Value
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.grammar.printer import show_expr
-from stlc.grammar.traverse import descendants
 from stlc.source import Span
 
 
@@ -55,7 +54,7 @@ def without_extremes(expr: ast.Compare, scope: Scope, evaluate: Evaluator) -> as
     for left, op, right in zip(expr.operands, expr.ops, expr.operands[1:], strict=False):
         span = expr.span if len(expr.ops) == 1 else left.span.to(right.span)
         part: ast.Expr = ast.Compare(span, (left, right), (op,))
-        extremes = [node for node in descendants(part) if isinstance(node, ast.Extreme)]
+        extremes = [node for node in part.walk() if isinstance(node, ast.Extreme)]
         if len(extremes) > 1:
             scope.fail(_refused(extremes[1], "stands once in a comparison"))
         if extremes:
@@ -95,7 +94,7 @@ class _Rewriting:
 
     def within(self, expr: ast.Expr) -> bool:
         """True if an expression contains the extreme."""
-        return any(node is self.extreme for node in descendants(expr))
+        return any(node is self.extreme for node in expr.walk())
 
     def held(self, expr: ast.Expr) -> ast.Expr:
         """Return the name under which the value of an expression is frozen."""

@@ -11,7 +11,7 @@ from stlc.compile.frontend.values import Number, Operand, TimeExpr, Value, noun
 from stlc.compile.ir import typed
 from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar import ast
-from stlc.grammar.words import OPERATORS, UNARY_TEMPORAL
+from stlc.grammar.words import OPERATORS
 from stlc.source import Span
 from stlc.units import Unit
 
@@ -213,7 +213,7 @@ def _negative(name: str, node: ast.Interval, ends: tuple[TimeExpr, TimeExpr], bo
     mirror = OPERATORS[name].mirror
     plain = all(not end.end and sign(end) <= 0 for end in ends)
     hints: tuple[str, ...] = ()
-    if mirror and plain and name in UNARY_TEMPORAL:
+    if mirror and plain and not OPERATORS[name].binary:
         near, far = _shown(high, node.hi), _shown(low, node.lo)
         hints = (f"{mirror}[{near}, {far}] {body.span.text}   looks back",)
     elif mirror:

@@ -16,17 +16,17 @@ from stlc.compile.frontend.values import Number, VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.ranges import usual_range
-from stlc.compile.ir.support import columns_in
 from stlc.diagnostics import Diagnostic, SpecError, UsageError, usage
 from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
+from stlc.grammar.spec import Spec
 from stlc.signature import Column
 from stlc.source import Source
 from stlc.units import Unit
 
 
 def read_overrides(
-    overrides: Mapping[str, str], spec: ast.Spec, interface: Interface | None
+    overrides: Mapping[str, str], spec: Spec, interface: Interface | None
 ) -> dict[str, ast.Expr]:
     """Return the expressions that `--set` gives to constants and parameters of a specification, by name.
 
@@ -163,7 +163,7 @@ def _in_column(number: Number, expr: ast.Expr, column: Column, unit: Unit, scope
     Raises:
         Failed: the number depends on a signal (E205), or has another unit than the column (E203).
     """
-    if columns_in(number.num):
+    if number.num.columns:
         message = "a parameter is drawn before anything moves: its distribution reads constants alone"
         scope.fail(Diagnostic("E205", message, expr.span))
     if number.bare:
@@ -171,7 +171,7 @@ def _in_column(number: Number, expr: ast.Expr, column: Column, unit: Unit, scope
         if wanted.offset != column.unit.offset:
             return stored(in_unit(number, wanted, scope), column.unit)
         factor = wanted.scale / column.unit.scale
-        return number.num if factor == 1 else ir.Op("mul", (number.num, ir.Const(factor)))
+        return number.num if factor == 1 else number.num * factor
     require_unit(number, column, expr, scope)
     return stored(on_scale(number, column.unit, expr.span, scope), column.unit)
 

@@ -217,7 +217,7 @@ def _polygon(point: VectorValue, corners: Sequence[VectorValue], span: Span, sco
     parts = [_left_of_all(point, triangle, span, scope) for triangle in triangles(corners)]
     inside = parts[0] if len(parts) == 1 else ir.BoolOp("or", tuple(parts), span)
     return Number(
-        ir.Where(inside, nearest.num, negated(nearest, span).num), nearest.unit, nearest.flexible, span=span
+        inside.select(nearest.num, negated(nearest, span).num), nearest.unit, nearest.flexible, span=span
     )
 
 

@@ -1,6 +1,6 @@
 """Resolution of syntax to a typed specification, with names, types and units checked.
 
-    ast.Spec --declare--> entries --evaluate--> typed.Spec
+    Spec --declare--> entries --evaluate--> typed.Spec
 
 Formulas keep their negations, implications and source locations. Times stay as written: in seconds, in steps,
 or as multiples of the planning horizon `T`.
@@ -20,10 +20,9 @@ from stlc.compile.frontend.declare import Declared, check_names, declare, ranged
 from stlc.compile.frontend.evaluate import evaluate
 from stlc.compile.frontend.expressions import resolve_formula
 from stlc.compile.frontend.interface import Interface
-from stlc.compile.frontend.modules import Module, load_modules
 from stlc.compile.frontend.parameters import parameters, read_overrides
-from stlc.compile.frontend.scope import Definition, Failed, Scope, enforced
-from stlc.compile.frontend.tags import Tags, nominal, reach_of_formula, reach_of_number, read_tags
+from stlc.compile.frontend.scope import Definition, Failed, Scope
+from stlc.compile.frontend.tags import Tags, reach_of_formula, reach_of_number, read_tags
 from stlc.compile.frontend.values import Number, Value, VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
@@ -32,6 +31,7 @@ from stlc.compile.ir.warnings import contradictions, safety_never_violated, vacu
 from stlc.diagnostics import Diagnostic, Findings, SpecError
 from stlc.grammar import ast
 from stlc.grammar.parser import MAX_ERRORS
+from stlc.grammar.spec import Module, Spec
 from stlc.signature import Column, Signature
 from stlc.source import Span
 
@@ -47,14 +47,14 @@ class File:
         files: files that the file imports.
     """
 
-    spec: ast.Spec
+    spec: Spec
     found: Declared
     scope: Scope
     files: tuple[File, ...] = field(default=(), repr=False)
 
 
 def declared(
-    spec: ast.Spec,
+    spec: Spec,
     modules: Iterable[Module],
     interface: Interface | None,
     overrides: Mapping[str, ast.Expr],
@@ -134,7 +134,7 @@ Item = TypeVar("Item")
 
 
 def resolve(
-    spec: ast.Spec,
+    spec: Spec,
     *,
     interface: Interface | None = None,
     overrides: Mapping[str, str] | None = None,
@@ -158,10 +158,10 @@ def resolve(
     findings = Findings()
     system_hints = _system_hints(interface)
     scope = Scope(sink=findings, temporal=True, time_unit=spec.time_unit, system_hints=system_hints)
-    file = declared(spec, load_modules(spec), interface, values, scope)
+    file = declared(spec, spec.modules(), interface, values, scope)
     _adopt_units(spec, values, file.found, file.scope)
     signature, parameters = signature_of(file, interface)
-    facts, ranges = enforced(signature.columns), nominal(signature.columns)
+    facts, ranges = signature.enforced, signature.nominal
     file = with_ranges(file, facts if interface is None else ranges)
     scope = file.scope
     constants = _constants(spec, interface, scope)
@@ -186,7 +186,7 @@ def resolve(
     )
 
 
-def _finish(findings: Sequence[Diagnostic], spec: ast.Spec, sink: list[Diagnostic]) -> None:
+def _finish(findings: Sequence[Diagnostic], spec: Spec, sink: list[Diagnostic]) -> None:
     """Append the warnings to `sink`; raise all errors together, in source order."""
 
     def place(finding: Diagnostic) -> tuple[bool, int]:
@@ -223,7 +223,7 @@ def _system_hints(interface: Interface | None) -> dict[str, str]:
     return found
 
 
-def _adopt_units(spec: ast.Spec, overrides: Mapping[str, ast.Expr], found: Declared, scope: Scope) -> None:
+def _adopt_units(spec: Spec, overrides: Mapping[str, ast.Expr], found: Declared, scope: Scope) -> None:
     """Give each override without a unit the unit of the constant that it replaces.
 
     For example, if the file has `const v = 3 m/s`, the override `v=4` means 4 m/s. The constants in `found`
@@ -242,7 +242,7 @@ def _adopt_units(spec: ast.Spec, overrides: Mapping[str, ast.Expr], found: Decla
                 found.entries[item.name] = replace(entry, unit=original.unit)
 
 
-def _constants(spec: ast.Spec, interface: Interface | None, scope: Scope) -> tuple[tuple[str, float], ...]:
+def _constants(spec: Spec, interface: Interface | None, scope: Scope) -> tuple[tuple[str, float], ...]:
     """Return (name, value in SI units) of each constant, one entry per component of a vector.
 
     E104 is reported for a constant that differs from the system's.
@@ -319,12 +319,12 @@ def _check_definitions(file: File) -> None:
 # ----------------------------------------------------------------- requirements
 
 
-def _items(spec: ast.Spec, kind: type[Item]) -> list[Item]:
+def _items(spec: Spec, kind: type[Item]) -> list[Item]:
     return [item for item in spec.items if isinstance(item, kind)]
 
 
 def _requirements(
-    spec: ast.Spec, kind: type[ast.Require | ast.Assume], scope: Scope, ranges: Mapping[str, Bounds]
+    spec: Spec, kind: type[ast.Require | ast.Assume], scope: Scope, ranges: Mapping[str, Bounds]
 ) -> tuple[typed.Requirement, ...]:
     """Return the requirements or assumptions (`kind`) that have no errors.
 
@@ -382,5 +382,5 @@ def _warnings(
     tag = next((tag for tag in item.tags if tag.name == "safety"), None)
     formula = requirement.formula
     found = [*vacuous(formula, signature, facts), *contradictions(formula, signature)]
-    weak = safety_never_violated(requirement, tag)
+    weak = safety_never_violated(requirement, None if tag is None else tag.span)
     return found if weak is None else [*found, weak]

@@ -6,7 +6,6 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from fractions import Fraction
 from typing import Any, Literal, NoReturn, TypeAlias
 
 from stlc.compile.frontend.values import EnumMember, Number, Value, VectorValue
@@ -17,7 +16,7 @@ from stlc.grammar import ast
 from stlc.signature import Column, Kind
 from stlc.similar import closest
 from stlc.source import Span
-from stlc.units import Unit, nearest
+from stlc.units import Unit
 
 MAX_NODES = 50_000
 MAX_LEVELS = 120
@@ -303,7 +302,7 @@ def column_value(column: Column) -> Number:
     """
     num: ir.Num = ir.Signal(column.name)
     if column.unit.ratio != 1:
-        num = ir.Op("mul", (num, ir.Const(column.unit.scale)))
+        num = num * column.unit.scale
     flexible = column.kind in ("real", "int") and not column.unit.text
     return Number(num, column.unit, flexible, kind=column.kind, labels=column.labels)
 
@@ -335,34 +334,6 @@ def member_entries(enums: Iterable[tuple[tuple[str, float], ...]]) -> dict[str, 
         for name, _ in labels:
             options.setdefault(name, []).append(labels)
     return {name: Known(EnumMember(name, tuple(found)), "enum member") for name, found in options.items()}
-
-
-def constant_value(value: float, unit: Unit = Unit.ONE) -> Number:
-    """Return the constant `value`, given in SI units, as a number in `unit`.
-
-    A constant without a unit takes the unit that its place in an expression requires.
-    """
-    bare = not unit.text
-    exact = Fraction(repr(value)) - unit.offset
-    kind: Literal["int", "real"] = "int" if bare and exact.denominator == 1 else "real"
-    return Number(ir.Const(nearest(exact)), unit, bare, bare, exact, kind)
-
-
-def enforced(columns: Iterable[Column]) -> dict[str, Bounds]:
-    """Return the ranges that columns never leave, each in the unit of its column.
-
-    Bools and enums have such a range, and so does a column whose range is marked as enforced (`Column.fact`).
-    """
-    facts: dict[str, Bounds] = {}
-    for column in columns:
-        if column.kind == "bool":
-            facts[column.name] = (0.0, 1.0)
-        elif column.labels:
-            values = [value for _, value in column.labels]
-            facts[column.name] = (min(values), max(values))
-        elif column.fact and column.low is not None and column.high is not None:
-            facts[column.name] = (column.low, column.high)
-    return facts
 
 
 def reserved(name: str) -> bool:

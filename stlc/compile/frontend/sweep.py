@@ -41,9 +41,9 @@ from stlc.compile.frontend.values import (
     Region,
     VectorValue,
     literal,
+    shifted,
 )
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import shifted
 from stlc.source import Span
 
 _SHORT = 1e-9
@@ -171,7 +171,7 @@ class _Sweep:
             there = self.apply("div", self.apply("add", *weighed), steep)
             opposed = ir.Predicate(self.apply("mul", slopes[i], slopes[j]).num, -1, strict=True)
             long = ir.Predicate(self.apply("sub", steep, literal(_SHORT, self.span)).num, strict=True)
-            meetings.append(self._choose(ir.BoolOp("and", (opposed, long)), there, best[i]))
+            meetings.append(self._choose(opposed & long, there, best[i]))
         return self.apply("min", *best, *meetings)
 
     def _approaches(self, faces: Sequence[Pair]) -> list[Number]:
@@ -190,7 +190,7 @@ class _Sweep:
             pull, stiffness = [], []
             for room, slope in zip(there, slopes, strict=True):
                 ahead = self.apply("add", room, self.apply("mul", slope, literal(_AHEAD, self.span)))
-                active = Number(ir.Indicator(ir.Predicate(ahead.num, -1, strict=True)))
+                active = Number(ir.Predicate(ahead.num, -1, strict=True).indicator())
                 pull.append(self.apply("mul", active, self.apply("mul", room, slope)))
                 stiffness.append(self.apply("mul", active, self.apply("square", slope)))
             step = self._ratio(*(total(items, self.span, self.scope) for items in (pull, stiffness)))
@@ -250,7 +250,7 @@ class _Sweep:
             between, astride = (
                 ir.Predicate(self.apply("mul", *signs).num, -1, strict=True) for signs in (sides, around)
             )
-            crossing = ir.BoolOp("and", (between, astride))
+            crossing = between & astride
             found.append(self._choose(crossing, self.negative(gap), gap))
         return found
 
@@ -294,7 +294,7 @@ class _Sweep:
         return self.apply("clip", number, literal(0, self.span), literal(1, self.span))
 
     def _choose(self, cond: ir.Formula, yes: Number, no: Number) -> Number:
-        return Number(ir.Where(cond, yes.num, no.num), no.unit, no.flexible, span=self.span)
+        return Number(cond.select(yes.num, no.num), no.unit, no.flexible, span=self.span)
 
     def apply(self, name: str, *args: Number) -> Number:
         """Return the function `name` applied to `args`; see `stlc.compile.ir.functions.FUNCTIONS`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from stlc.compile.frontend.arithmetic import refuse_point
@@ -14,23 +14,11 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.functions import Bounds
 from stlc.compile.ir.ranges import bounds
-from stlc.compile.ir.support import columns_in
-from stlc.compile.ir.traverse import nodes
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
-from stlc.signature import Column
 from stlc.similar import closest
 from stlc.source import Span
 from stlc.units import Unit
-
-
-def nominal(columns: Iterable[Column]) -> dict[str, Bounds]:
-    """Return the declared range of each column that has one, enforced or not, in the unit of the column."""
-    return {
-        column.name: (column.low, column.high)
-        for column in columns
-        if column.low is not None and column.high is not None
-    }
 
 
 def reach_of_formula(
@@ -62,7 +50,7 @@ def reach_of_number(num: ir.Num, ranges: Mapping[str, Bounds], place: Span, scop
     ends = bounds(num, ranges)
     if ends is not None and all(map(math.isfinite, ends)) and ends != (0.0, 0.0):
         return max(map(abs, ends))
-    missing = sorted(columns_in(num) - ranges.keys())
+    missing = sorted(num.columns - ranges.keys())
     help_: tuple[str, ...] = ("say it: `@scale(10)`",)
     message = "how far this reaches is not known"
     if missing:
@@ -74,7 +62,7 @@ def reach_of_number(num: ir.Num, ranges: Mapping[str, Bounds], place: Span, scop
 
 def _predicates(formula: typed.Formula, ranges: dict[str, Bounds]) -> Iterator[typed.Predicate]:
     """Yield the predicates of a formula; the ranges of values bound by `freeze` are added to `ranges`."""
-    for node in nodes(formula):
+    for node in formula.walk():
         if isinstance(node, typed.Predicate):
             yield node
         elif isinstance(node, typed.Freeze):

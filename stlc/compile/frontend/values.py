@@ -11,7 +11,7 @@ from stlc.compile.ir import typed
 from stlc.grammar import ast
 from stlc.signature import Kind
 from stlc.source import Span
-from stlc.units import Unit
+from stlc.units import Unit, nearest
 
 Labels: TypeAlias = tuple[tuple[str, float], ...]
 
@@ -71,6 +71,17 @@ class Number(Placed):
     def constant(self) -> float | None:
         """Value of a constant, in SI units counted from the zero of its unit; None for a varying number."""
         return self.num.value if isinstance(self.num, ir.Const) else None
+
+    @classmethod
+    def fixed(cls, value: float, unit: Unit = Unit.ONE) -> Number:
+        """Return the constant `value`, given in SI units, as a number in `unit`.
+
+        A constant without a unit takes the unit that its place in an expression requires.
+        """
+        bare = not unit.text
+        exact = Fraction(repr(value)) - unit.offset
+        kind: Literal["int", "real"] = "int" if bare and exact.denominator == 1 else "real"
+        return cls(ir.Const(nearest(exact)), unit, bare, bare, exact, kind)
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +206,7 @@ def is_formula(value: Value) -> bool:
 
     A bool signal b can be used as a formula too, but it only stands for `b >= 1/2`.
     """
-    return isinstance(value, typed.Node) or (isinstance(value, Number) and value.formula is not None)
+    return isinstance(value, typed.Formula) or (isinstance(value, Number) and value.formula is not None)
 
 
 def literal(value: Fraction | float | int, span: Span | None = None) -> Number:
@@ -207,7 +218,7 @@ def literal(value: Fraction | float | int, span: Span | None = None) -> Number:
 
 def at(value: Value, span: Span) -> Value:
     """Return a value with the source location `span`; a formula keeps its own location."""
-    return value if isinstance(value, typed.Node) else replace(value, span=span)
+    return value if isinstance(value, typed.Formula) else replace(value, span=span)
 
 
 def unit_text(number: Number) -> str:
@@ -229,7 +240,7 @@ def describe(value: Value) -> str:
             return "enum member"
         case TimeExpr():
             return "time"
-        case typed.Node():
+        case typed.Formula():
             return "formula"
         case _:
             return "region"
@@ -244,3 +255,26 @@ def noun(value: Value) -> str:
             return "an enum member"
         case _:
             return f"a {describe(value)}"
+
+
+def shifted(num: ir.Num, steps: int, *, clamped: bool = False, delay: typed.Time | None = None) -> ir.Num:
+    """Return a number shifted in time by `steps` samples (positive: later).
+
+    If `delay` is given, the number is shifted by this time in addition. Outside the trace a `clamped` number
+    repeats the first or last sample.
+    """
+
+    def moved(leaf: ir.Num) -> ir.Num:
+        if not isinstance(leaf, (ir.Signal, ir.ShiftedSignal)):
+            return leaf
+        there, ends, later = steps, clamped, delay
+        if isinstance(leaf, ir.ShiftedSignal):
+            there, ends = there + leaf.steps, ends or leaf.clamped
+        if isinstance(leaf, typed.DelayedSignal):
+            later = leaf.delay.plus(delay)
+        if later is not None:
+            return typed.DelayedSignal(leaf.name, there, ends, later)
+        return ir.ShiftedSignal(leaf.name, there, ends) if there else ir.Signal(leaf.name)
+
+    found: ir.Num = num.map_leaves(moved)
+    return found

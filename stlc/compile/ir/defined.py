@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import Analysis, fold, reach_of
+from stlc.compile.ir.support import Analysis, Offsets
 
 Undefined: TypeAlias = tuple[range, ...]
 """Samples at which something is undefined, in order: disjoint ranges, none of them empty."""
@@ -45,7 +45,7 @@ def undefined(formula: ir.Formula, samples: int) -> Undefined:
     `next` and `shift` are undefined if they read a sample outside the trace. A window "to the end" is defined
     if it contains a sample.
     """
-    return fold(formula, _Undefinedness(samples))
+    return formula.fold(_Undefinedness(samples))
 
 
 @final
@@ -54,13 +54,13 @@ class _Undefinedness(Analysis[Undefined]):
     samples: int
 
     def predicate(self, num: ir.Num) -> Undefined:
-        around = reach_of(num)
+        around = num.reach
         return self._merged([range(around.past), range(self.samples - around.future, self.samples)])
 
     def constant(self) -> Undefined:
         return ()
 
-    def over(self, parts: Sequence[Undefined], offsets: Sequence[ir.Offsets]) -> Undefined:
+    def over(self, parts: Sequence[Undefined], offsets: Sequence[Offsets]) -> Undefined:
         """Return the samples at which an operator reads an operand where that is undefined.
 
         Operand i is undefined at `parts[i]`, and is read at `offsets[i]`, which begin with the trace and end

@@ -8,13 +8,12 @@ satisfaction on the samples implies the formula as written: outwards for `always
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.traverse import NumberLeaf, leaves, map_children, map_leaves, nodes, numbers
+from stlc.compile.ir.lower import lower
 from stlc.diagnostics import Diagnostic, tell
 from stlc.jsontext import Num
 from stlc.source import Span
@@ -60,88 +59,110 @@ class Grid:
         """Steps of a plan; None where unknown."""
         return self.horizon if self.plan is None else self.plan
 
+    def lacks(self, formula: typed.Formula) -> bool:
+        """True if a formula needs a time step or a horizon that the grid does not have."""
+        return any(
+            (time.seconds and self.dt is None) or (time.horizons and self.horizon is None)
+            for time in formula.times()
+        )
 
-def lacks(grid: Grid, formula: typed.Formula) -> bool:
-    """True if a formula needs a time step or a horizon that `grid` does not have."""
-    return any(
-        (time.seconds and grid.dt is None) or (time.horizons and grid.horizon is None)
-        for time in _times(formula)
-    )
+    def window(self, interval: typed.Interval, sink: list[Diagnostic], *, outward: bool) -> ir.Window:
+        """Return the window of an interval, in steps.
 
+        Args:
+            interval: interval whose bounds are sums of seconds, steps and horizons.
+            sink: list to which findings are appended: W304 for a rounded bound, E305 for an interval without
+                a sample, E311 for an unknown time step or horizon, E301, E302 and E005 for an invalid
+                interval. After an error the returned window is only a placeholder.
+            outward: whether bounds between two samples are rounded outwards; else inwards.
+        """
+        lo = self.in_steps(interval.lo, sink, interval.span)
+        if lo is None:
+            return _EMPTY
+        hi = None if interval.hi is None else self.in_steps(interval.hi, sink, interval.span)
+        if hi is None and interval.hi is not None:
+            return _EMPTY
+        invalid = _invalid(interval, lo, hi)
+        if invalid is not None:
+            tell(sink, invalid)
+            return _EMPTY
+        first = _first(lo, outward=outward, excluded=interval.lo_open)
+        _note_rounding(interval.lo, lo, first, self, sink)
+        if hi is None or interval.hi is None:
+            return ir.Window(first, None)
+        last = -_first(-hi, outward=outward, excluded=interval.hi_open)
+        _note_rounding(interval.hi, hi, last, self, sink)
+        if last < first:
+            tell(sink, _without_sample(interval, self))
+            return _EMPTY
+        return ir.Window(first, last)
 
-def counts_samples(formula: typed.Formula) -> bool:
-    """True if a formula counts samples: `3 steps`, `dt`, `prev(p)`; it then depends on `dt`."""
-    return (
-        any(time.steps for time in _times(formula))
-        or any(isinstance(node, typed.Shift) and node.delay is None for node in nodes(formula))
-        or any(isinstance(leaf, ir.ShiftedSignal) and leaf.steps for leaf in _read(formula))
-    )
+    def in_steps(self, time: typed.Time, sink: list[Diagnostic], span: Span | None) -> Fraction | None:
+        """Return a time in steps.
 
+        The result is None, with E311 in `sink`, if the grid lacks a step or horizon that the time needs.
+        """
+        span = time.span or span
+        if time.horizons and self.horizon is None:
+            tell(sink, _needs_grid("`T` is the planning horizon of a system", span))
+            return None
+        if time.seconds and self.dt is None:
+            tell(sink, _needs_grid("seconds become samples with the step `dt` of a system", span))
+            return None
+        seconds = time.seconds / self.dt if self.dt is not None else Fraction(0)
+        return seconds + time.steps + time.horizons * (self.horizon or 0)
 
-def _times(formula: typed.Formula) -> Iterator[typed.Time]:
-    """Yield the bounds of intervals and the delays of `shift` in a formula."""
-    for node in nodes(formula):
-        if isinstance(node, (typed.Temporal, typed.Until)):
-            yield from (end for end in (node.interval.lo, node.interval.hi) if end is not None)
-        elif isinstance(node, typed.Shift) and node.delay is not None:
-            yield node.delay
-    yield from (leaf.delay for leaf in _read(formula) if isinstance(leaf, typed.DelayedSignal))
+    def duration(self, steps: int) -> str:
+        """Text of a number of steps, such as `2.5 s = 25 steps`; `25 steps` if no time step is known."""
+        count = f"{steps} step{'' if steps == 1 else 's'}"
+        return count if self.dt is None else f"{self.in_words(Fraction(steps))} = {count}"
 
+    def in_words(self, steps: Fraction) -> str:
+        """Return the text of a time for messages: in steps if no time step is known."""
+        if self.dt is None:
+            return f"{nearest(steps):g} steps"
+        return time_text(steps * self.dt)
 
-def _read(formula: typed.Formula) -> Iterator[NumberLeaf]:
-    """Yield the constants and signals that a formula reads."""
-    return (leaf for num in numbers(formula) for leaf in leaves(num))
+    def in_samples(self, formula: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
+        """Return a formula with the delays of `shift` converted from seconds to samples.
+
+        Findings are appended to `sink`: E205 for a delay that is too long or not a whole number of samples,
+        E311 for an unknown time step or horizon. A delay with an error is replaced by one sample.
+        """
+
+        def leaf(num: ir.Num) -> ir.Num:
+            if not isinstance(num, typed.DelayedSignal):
+                return num
+            steps = num.steps + _samples(num.delay, self, sink)
+            return ir.ShiftedSignal(num.name, steps, num.clamped) if steps else ir.Signal(num.name)
+
+        def below(node: typed.Formula) -> typed.Formula:
+            node = node.map_children(formulas=below, numbers=lambda num: num.map_leaves(leaf))
+            if isinstance(node, typed.Shift) and node.delay is not None:
+                return replace(node, steps=_samples(node.delay, self, sink), delay=None)
+            return node
+
+        return below(formula)
+
+    def delay_fault(self, steps: Fraction, span: Span | None) -> Diagnostic | None:
+        """Return the error E205 if a delay is no whole number of steps or exceeds `MAX_DELAY`, else None."""
+        if steps.denominator != 1 and self.dt is not None:
+            low, high = (self.in_words(Fraction(n)) for n in (math.floor(steps), math.ceil(steps)))
+            message = f"{self.in_words(steps)} is not a whole number of {float(self.dt):g} s steps"
+            help_ = (f"use {low} or {high}, or a dt that fits",)
+            return Diagnostic("E205", message, span, "there is no sample at this time", help=help_)
+        if steps.denominator != 1:
+            return no_delay("`shift` goes a whole number of samples, known at compile time", span)
+        if abs(steps) > MAX_DELAY:
+            return no_delay(f"`shift` goes {MAX_DELAY:,} samples at most", span)
+        return None
+
+    def lower(self, formula: typed.Formula, sink: list[Diagnostic]) -> ir.Formula:
+        """Lower a typed formula to an IR formula (`stlc.compile.ir.lower`)."""
+        return lower(formula, self, sink)
 
 
 # ------------------------------------------------------------------------------------ windows
-
-
-def to_window(interval: typed.Interval, grid: Grid, sink: list[Diagnostic], *, outward: bool) -> ir.Window:
-    """Return the window of an interval, in steps.
-
-    Args:
-        interval: interval whose bounds are sums of seconds, steps and horizons.
-        grid: time step and horizon.
-        sink: list to which findings are appended: W304 for a rounded bound, E305 for an interval without a
-            sample, E311 for an unknown time step or horizon, E301, E302 and E005 for an invalid interval.
-            After an error the returned window is only a placeholder.
-        outward: whether bounds between two samples are rounded outwards; else inwards.
-    """
-    lo = in_steps(interval.lo, grid, sink, interval.span)
-    if lo is None:
-        return _EMPTY
-    hi = None if interval.hi is None else in_steps(interval.hi, grid, sink, interval.span)
-    if hi is None and interval.hi is not None:
-        return _EMPTY
-    invalid = _invalid(interval, lo, hi)
-    if invalid is not None:
-        tell(sink, invalid)
-        return _EMPTY
-    first = _first(lo, outward=outward, excluded=interval.lo_open)
-    _note_rounding(interval.lo, lo, first, grid, sink)
-    if hi is None or interval.hi is None:
-        return ir.Window(first, None)
-    last = -_first(-hi, outward=outward, excluded=interval.hi_open)
-    _note_rounding(interval.hi, hi, last, grid, sink)
-    if last < first:
-        tell(sink, _without_sample(interval, grid))
-        return _EMPTY
-    return ir.Window(first, last)
-
-
-def in_steps(time: typed.Time, grid: Grid, sink: list[Diagnostic], span: Span | None) -> Fraction | None:
-    """Return a time in steps.
-
-    The result is None, with E311 in `sink`, if `grid` lacks a step or horizon that the time needs.
-    """
-    if time.horizons and grid.horizon is None:
-        tell(sink, _needs_grid("`T` is the planning horizon of a system", time.span or span))
-        return None
-    if time.seconds and grid.dt is None:
-        tell(sink, _needs_grid("seconds become samples with the step `dt` of a system", time.span or span))
-        return None
-    seconds = time.seconds / grid.dt if grid.dt is not None else Fraction(0)
-    return seconds + time.steps + time.horizons * (grid.horizon or 0)
 
 
 def _first(lo: Fraction, *, outward: bool, excluded: bool) -> int:
@@ -182,28 +203,15 @@ def _note_rounding(time: typed.Time, exact: Fraction, taken: int, grid: Grid, si
     below, above = math.floor(exact), math.ceil(exact)
     finding = Diagnostic(
         "W304",
-        f"{in_words(exact, grid)} is not a whole number of {_step(grid)}",
+        f"{grid.in_words(exact)} is not a whole number of {_step(grid)}",
         time.span,
-        label=f"taken as {in_words(Fraction(taken), grid)} here",
+        label=f"taken as {grid.in_words(Fraction(taken))} here",
         help=(
-            f"use {in_words(Fraction(below), grid)} or {in_words(Fraction(above), grid)}, or a dt that fits",
+            f"use {grid.in_words(Fraction(below))} or {grid.in_words(Fraction(above))}, or a dt that fits",
         ),
         note=("`always` and `release` also take the sample outside, `eventually` and `until` do not",),
     )
     tell(sink, finding)
-
-
-def duration(steps: int, grid: Grid) -> str:
-    """Text of a number of steps, such as `2.5 s = 25 steps`; `25 steps` if no time step is known."""
-    count = f"{steps} step{'' if steps == 1 else 's'}"
-    return count if grid.dt is None else f"{in_words(Fraction(steps), grid)} = {count}"
-
-
-def in_words(steps: Fraction, grid: Grid) -> str:
-    """Return the text of a time for messages: in steps if no time step is known."""
-    if grid.dt is None:
-        return f"{nearest(steps):g} steps"
-    return time_text(steps * grid.dt)
 
 
 def _step(grid: Grid) -> str:
@@ -232,51 +240,15 @@ def _needs_grid(text: str, span: Span | None) -> Diagnostic:
 # ------------------------------------------------------------------------------------- delays
 
 
-def in_samples(formula: typed.Formula, grid: Grid, sink: list[Diagnostic]) -> typed.Formula:
-    """Return a formula with the delays of `shift` converted from seconds to samples.
-
-    Findings are appended to `sink`: E205 for a delay that is too long or not a whole number of samples, E311
-    for an unknown time step or horizon. A delay with an error is replaced by one sample.
-    """
-
-    def leaf(num: ir.Num) -> ir.Num:
-        if not isinstance(num, typed.DelayedSignal):
-            return num
-        steps = num.steps + _samples(num.delay, grid, sink)
-        return ir.ShiftedSignal(num.name, steps, num.clamped) if steps else ir.Signal(num.name)
-
-    def below(node: typed.Formula) -> typed.Formula:
-        node = map_children(node, formulas=below, numbers=lambda num: map_leaves(num, leaf))
-        if isinstance(node, typed.Shift) and node.delay is not None:
-            return replace(node, steps=_samples(node.delay, grid, sink), delay=None)
-        return node
-
-    return below(formula)
-
-
 def _samples(delay: typed.Time, grid: Grid, sink: list[Diagnostic]) -> int:
-    steps = in_steps(delay, grid, sink, delay.span)
+    steps = grid.in_steps(delay, sink, delay.span)
     if steps is None:
         return 1
-    finding = delay_fault(steps, delay.span, grid)
+    finding = grid.delay_fault(steps, delay.span)
     if finding is not None:
         tell(sink, finding)
         return 1
     return int(steps)
-
-
-def delay_fault(steps: Fraction, span: Span | None, grid: Grid) -> Diagnostic | None:
-    """Return the error E205 if a delay is not a whole number of steps or exceeds `MAX_DELAY`, else None."""
-    if steps.denominator != 1 and grid.dt is not None:
-        low, high = (in_words(Fraction(n), grid) for n in (math.floor(steps), math.ceil(steps)))
-        message = f"{in_words(steps, grid)} is not a whole number of {float(grid.dt):g} s steps"
-        help_ = (f"use {low} or {high}, or a dt that fits",)
-        return Diagnostic("E205", message, span, "there is no sample at this time", help=help_)
-    if steps.denominator != 1:
-        return no_delay("`shift` goes a whole number of samples, known at compile time", span)
-    if abs(steps) > MAX_DELAY:
-        return no_delay(f"`shift` goes {MAX_DELAY:,} samples at most", span)
-    return None
 
 
 def no_delay(message: str, span: Span | None) -> Diagnostic:

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.ranges import has_value
-from stlc.compile.ir.traverse import leaves, map_children, numbers, subexpressions
 
 Floats: TypeAlias = NDArray[np.float64]
 Names: TypeAlias = frozenset[str]
@@ -52,7 +51,7 @@ def without_holes(env: Mapping[str, Floats], holes: Iterable[str]) -> dict[str, 
 @lru_cache(maxsize=512)
 def partial(formula: ir.Formula) -> bool:
     """True if a formula calls a function outside of whose domain the signals may be."""
-    return any(_is_partial(num, frozenset()) for num in numbers(formula))
+    return any(_is_partial(num, frozenset()) for num in formula.numbers())
 
 
 @lru_cache(maxsize=512)
@@ -76,7 +75,7 @@ def _unsure(formula: ir.Formula, holes: Names, nans: Names | None, *, least: boo
             if known is None:
                 return atom
             # outside of the trace the guard equals the predicate: false before a negation if windows are cut
-            guard = known if least is (atom.sign > 0) else ir.Op("neg", (known,))
+            guard = known if least is (atom.sign > 0) else -known
             test = ir.Predicate(guard, sign=atom.sign, guard=True)
             return ir.BoolOp("and" if least else "or", (atom, test))
         case ir.Freeze(bindings=bindings, body=body):
@@ -90,14 +89,14 @@ def _unsure(formula: ir.Formula, holes: Names, nans: Names | None, *, least: boo
             more = tuple((KNOWN + name, num) for name, num in tests.items())
             return replace(formula, bindings=(*bindings, *more), body=inner)
         case _:
-            return map_children(formula, formulas=lambda part: _unsure(part, holes, nans, least=least))
+            return formula.map_children(formulas=lambda part: _unsure(part, holes, nans, least=least))
 
 
 def _known(num: ir.Num, holes: Names) -> ir.Num | None:
     """An expression that is 1 where all signals in `num` are known, else -1; None if they all are."""
     found = dict.fromkeys(
         replace(leaf, name=KNOWN + leaf.name)
-        for leaf in leaves(num)
+        for leaf in num.leaves()
         if isinstance(leaf, (ir.Signal, ir.ShiftedSignal, ir.FrozenVar)) and leaf.name in holes
     )
     if not found:
@@ -111,7 +110,7 @@ def _is_partial(num: ir.Num, nans: Names) -> bool:
         (isinstance(part, ir.Op) and not has_value(part))
         or (isinstance(part, ir.FrozenVar) and part.name in nans)
         or (isinstance(part, ir.Extern) and _returns_nan(part))
-        for part in subexpressions(num)
+        for part in num.subexpressions()
     )
 
 
@@ -129,12 +128,12 @@ def _decided(atom: ir.Predicate, nans: Names | None, *, least: bool) -> ir.Predi
         return atom
     num = _with_nan(atom.num, nans)
     other = ir.Const(-math.inf if least is (atom.sign > 0) else math.inf)
-    return replace(atom, num=ir.Where(_is_number(num), num, other))
+    return replace(atom, num=_is_number(num).select(num, other))
 
 
 def _is_number(num: ir.Num) -> ir.Formula:
     """Return a condition that is false where a number is NaN, since no comparison with NaN is true."""
-    return ir.Predicate(ir.Op("abs", (num,)))
+    return ir.Predicate(num.apply("abs"))
 
 
 def _with_nan(num: ir.Num, nans: Names) -> ir.Num:
@@ -144,16 +143,16 @@ def _with_nan(num: ir.Num, nans: Names) -> ir.Num:
     """
     if not _is_partial(num, nans):
         return num
-    num = map_children(num, numbers=lambda part: _with_nan(part, nans))
+    num = num.map_children(numbers=lambda part: _with_nan(part, nans))
     match num:
         case ir.Where(cond, yes, no):
             return _chosen(cond, yes, no, nans)
         case ir.Indicator(cond):
-            lost = any(_is_partial(part, nans) for part in numbers(cond))
+            lost = any(_is_partial(part, nans) for part in cond.numbers())
             return _chosen(cond, ir.Const(1.0), ir.Const(0.0), nans) if lost else num
         case ir.Extern(args=args):
             for arg in args:
-                num = ir.Where(_is_number(arg), num, _NAN) if _is_partial(arg, nans) else num
+                num = _is_number(arg).select(num, _NAN) if _is_partial(arg, nans) else num
             return num
         case _:
             return num
@@ -163,5 +162,5 @@ def _chosen(cond: ir.Formula, yes: ir.Num, no: ir.Num, nans: Names) -> ir.Num:
     """Return `yes` where a condition holds, `no` where it does not, and NaN where that is unknown."""
     holds, may_hold = (_unsure(cond, frozenset(), nans, least=least) for least in (True, False))
     if holds is may_hold:
-        return ir.Where(cond, yes, no)
-    return ir.Where(holds, yes, ir.Where(may_hold, _NAN, no))
+        return cond.select(yes, no)
+    return holds.select(yes, may_hold.select(_NAN, no))

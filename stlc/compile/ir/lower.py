@@ -13,17 +13,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import final
+from typing import TYPE_CHECKING, final
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.discretize import Grid, to_window
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.ir.nodes import DUAL, OPERATORS
 from stlc.compile.ir.normal_form import literal, normal
-from stlc.compile.ir.traverse import from_now, map_children, nodes, on_clock, operands
 from stlc.diagnostics import Diagnostic
 from stlc.units import Unit
+
+if TYPE_CHECKING:
+    from stlc.compile.ir.discretize import Grid
 
 
 def as_written(requirement: typed.Requirement) -> typed.Requirement:
@@ -33,7 +34,7 @@ def as_written(requirement: typed.Requirement) -> typed.Requirement:
     as well.
     """
     formula, scale = requirement.formula, requirement.scale
-    units = [node.written for node in nodes(formula) if isinstance(node, typed.Predicate) and not node.guard]
+    units = [node.written for node in formula.walk() if isinstance(node, typed.Predicate) and not node.guard]
     alike = all(unit.same_dims(units[0]) and unit.ratio == units[0].ratio for unit in units)
     if units and alike and scale != 1:
         scale /= units[0].scale
@@ -43,7 +44,7 @@ def as_written(requirement: typed.Requirement) -> typed.Requirement:
 def _in_written_units(formula: typed.Formula) -> typed.Formula:
     if isinstance(formula, typed.Predicate):
         return replace(formula, num=in_unit(formula.num, formula.written), unit=formula.written)
-    return map_children(formula, formulas=_in_written_units)
+    return formula.map_children(formulas=_in_written_units)
 
 
 def in_unit(num: ir.Num, unit: Unit) -> ir.Num:
@@ -62,7 +63,7 @@ def in_unit(num: ir.Num, unit: Unit) -> ir.Num:
         case ir.Where():
             return replace(num, yes=in_unit(num.yes, unit), no=in_unit(num.no, unit))
         case _:
-            return ir.Op("div", (num, ir.Const(unit.scale)))
+            return num / unit.scale
 
 
 def lower(formula: typed.Formula, grid: Grid, sink: list[Diagnostic]) -> ir.Formula:
@@ -135,9 +136,9 @@ class _Lowering:
 
     def _timed(self, node: typed.Temporal | typed.Until, op: str) -> ir.Formula:
         """Lower a temporal operator as `op`: the operator itself or, if it is negated, its dual."""
-        if on_clock(node):
-            return ir.AtStart(self._timed(from_now(node), op), node.span)
-        parts = [self.formula(part) for part in operands(node)]
-        window = to_window(node.interval, self.grid, self.sink, outward=op == OPERATORS[op].names[0])
+        if node.on_clock:
+            return ir.AtStart(self._timed(node.from_now(), op), node.span)
+        parts = [self.formula(part) for part in node.operands]
+        window = self.grid.window(node.interval, self.sink, outward=op == OPERATORS[op].names[0])
         lowered: ir.Formula = OPERATORS[op](op, window, *parts, node.span)
         return lowered

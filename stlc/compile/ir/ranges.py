@@ -16,7 +16,6 @@ from typing import TypeAlias
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS, Bounds
-from stlc.compile.ir.traverse import leaves
 
 _DEVIATIONS = 3.0
 """Standard deviations around the mean that hold nearly all draws."""
@@ -75,10 +74,10 @@ def bounds(num: ir.Num, facts: KnownRanges) -> Bounds | None:
             return (min(left[0], right[0]), max(left[1], right[1]))
         case ir.Indicator():
             return (0.0, 1.0)
-        case ir.Extern():
+        case ir.Signal(name) | ir.ShiftedSignal(name) | ir.FrozenVar(name):
+            return facts.get(name)
+        case _:
             return None
-        case leaf:
-            return facts.get(leaf.name)
 
 
 def has_value(num: ir.Op) -> bool:
@@ -89,7 +88,7 @@ def has_value(num: ir.Op) -> bool:
     rule = FUNCTIONS[num.name].domain
     if rule is None:
         return True
-    facts = {leaf.name: _ANYTHING for leaf in leaves(num) if not isinstance(leaf, ir.Const)}
+    facts = {leaf.name: _ANYTHING for leaf in num.leaves() if not isinstance(leaf, ir.Const)}
     return rule([bounds(arg, facts) or _ANYTHING for arg in num.args])
 
 

@@ -17,8 +17,6 @@ from types import MappingProxyType
 from typing import Any
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.normal_form import joined
-from stlc.compile.ir.traverse import frozen_in, map_children, numbers, operands, substitute_frozen
 from stlc.compile.semantics.semantics import Exact, Semantics
 
 _EXACT = Exact()
@@ -32,7 +30,7 @@ def simplify(formula: ir.Formula, semantics: Semantics = _EXACT) -> ir.Formula:
         formula: formula in negation normal form.
         semantics: semantics under which the robustness is preserved; the exact semantics allows all laws.
     """
-    whole = map_children(formula, formulas=lambda part: simplify(part, semantics))
+    whole = formula.map_children(formulas=lambda part: simplify(part, semantics))
     law = _LAWS.get(type(whole))
     return whole if law is None else law(whole, semantics)
 
@@ -42,10 +40,10 @@ def _join(whole: ir.BoolOp, semantics: Semantics) -> ir.Formula:
     flat: list[ir.Formula] = []
     for item in whole.items:
         same = isinstance(item, ir.BoolOp) and item.op == whole.op and semantics.associative
-        flat += operands(item) if same else (item,)
+        flat += item.operands if same else (item,)
     if semantics.idempotent:
         flat = list(dict.fromkeys(flat))
-    return joined(whole.op, flat, whole.span)
+    return ir.BoolOp.joined(whole.op, flat, whole.span)
 
 
 def _window(node: ir.Temporal | ir.PastTemporal, semantics: Semantics) -> ir.Formula:
@@ -73,13 +71,13 @@ def _at_start(node: ir.AtStart, _semantics: Semantics) -> ir.Formula:
 
 def _freeze(node: ir.Freeze, _semantics: Semantics) -> ir.Formula:
     """Drop unused bindings of a `freeze`; if its body is a predicate, insert the bound numbers there."""
-    read = frozenset().union(*map(frozen_in, numbers(node.body)))
+    read = frozenset().union(*(each.frozen for each in node.body.numbers()))
     kept = tuple((name, num) for name, num in node.bindings if name in read)
     if not kept:
         return node.body
     if not isinstance(node.body, ir.Predicate):
         return replace(node, bindings=kept)
-    return replace(node.body, num=substitute_frozen(node.body.num, dict(kept)))
+    return replace(node.body, num=node.body.num.substitute_frozen(dict(kept)))
 
 
 def _sum(outer: ir.Window, inner: ir.Window, semantics: Semantics) -> ir.Window | None:

@@ -8,7 +8,6 @@ from typing import Any
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
-from stlc.compile.ir.traverse import operands
 from stlc.grammar.printer import show_name
 
 _LEVELS = {"+": 1, "-": 1, "*": 2, "/": 2, "%": 2, "^": 4}
@@ -61,7 +60,7 @@ def _parts(formula: ir.Formula) -> Sequence[ir.Formula]:
     The test of a timer is an `or` of two predicates: one with infinite robustness, and one with finite
     robustness (`timers.timer_test`). The text shows only the first one.
     """
-    items = operands(formula)
+    items = formula.operands
     if not isinstance(formula, ir.BoolOp):
         return items
     tests = {item.num for item in items if isinstance(item, ir.Predicate) and item.guard}
@@ -106,11 +105,11 @@ def show_number(num: ir.Num, level: int = 0) -> str:
     return f"({text})" if own < level else text
 
 
-def _leaf(leaf: ir.Signal | ir.ShiftedSignal | ir.FrozenVar) -> str:
+def _leaf(leaf: Any) -> str:
     name = shown(leaf.name)
     if not isinstance(leaf, ir.ShiftedSignal):
         return "elapsed" if leaf == ir.Signal(ir.ELAPSED) else name
-    if leaf == ir.at_first(ir.Signal(leaf.name)):
+    if leaf == ir.Signal(leaf.name).at_first:
         return f"first({name})"
     stepping = {1: "next", -1: "prev"}.get(leaf.steps)
     return f"{stepping}({name})" if stepping else f"shift({name}, {leaf.steps})"
@@ -136,5 +135,5 @@ def _number(num: ir.Num) -> tuple[str, int]:
             return f"ind({show_formula(cond)})", _TOP
         case ir.Where(cond, yes, no):
             return f"if {show_formula(cond)} then {show_number(yes)} else {show_number(no)}", 0
-        case leaf:
-            return _leaf(leaf), _TOP
+        case _:
+            return _leaf(num), _TOP

@@ -8,11 +8,9 @@ from dataclasses import dataclass, field
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.normal_form import Sign, normal
+from stlc.compile.ir.normal_form import normal
 from stlc.compile.ir.ranges import KnownRanges, bounds
-from stlc.compile.ir.traverse import leaves, nodes, numbers, subexpressions
 from stlc.diagnostics import Diagnostic
-from stlc.grammar import ast
 from stlc.signature import Signature
 from stlc.source import Span
 
@@ -27,12 +25,12 @@ def contradictions(formula: typed.Formula, signature: Signature) -> Iterator[Dia
     """
     whole = {column.name for column in signature.columns if column.kind != "real"}
     reported: set[Span] = set()
-    for node in reversed(list(nodes(formula))):
+    for node in reversed(list(formula.walk())):
         if isinstance(node, typed.Logic) and node.op == "if":
             node = typed.Logic(node.items[1].span, "and", node.items[:2])
         if not isinstance(node, typed.Logic) or node.op not in _DECIDED_BY or node.span in reported:
             continue
-        found = None if any(part.span in reported for part in nodes(node)) else _decided(node, whole)
+        found = None if any(part.span in reported for part in node.walk()) else _decided(node, whole)
         if found is not None:
             reported.add(node.span)
             yield found
@@ -83,7 +81,7 @@ class _Linear:
         return _Linear({p: f for p, f in parts.items() if f}, self.constant + factor * other.constant)
 
 
-_DECIDED_BY: Mapping[str, Sign] = {"and": 1, "or": -1, "->": -1}
+_DECIDED_BY: Mapping[str, typed.Sign] = {"and": 1, "or": -1, "->": -1}
 """Connective -> 1 if a contradiction in it makes it false, -1 if one in its negation makes it true."""
 
 
@@ -184,8 +182,10 @@ def jumps(formula: typed.Formula, ranges: KnownRanges) -> Iterator[Diagnostic]:
         formula: formula whose names and units are resolved.
         ranges: ranges of the signals by name, each in the unit in which the signal is stored.
     """
-    for node in nodes(formula):
-        if isinstance(node, typed.Predicate) and any(_jumps(num, ranges) for num in subexpressions(node.num)):
+    for node in formula.walk():
+        if isinstance(node, typed.Predicate) and any(
+            _jumps(num, ranges) for num in node.num.subexpressions()
+        ):
             yield Diagnostic(
                 "W403",
                 "a modulo in a predicate that is trained for",
@@ -287,7 +287,7 @@ def _because(formula: typed.Formula, signature: Signature, facts: KnownRanges) -
     Only ranges in `facts` are named; the text is empty if there are none. `signature` gives the units of the
     signals.
     """
-    read = (leaf for num in numbers(formula) for leaf in leaves(num))
+    read = (leaf for num in formula.numbers() for leaf in num.leaves())
     names = dict.fromkeys(leaf.name for leaf in read if isinstance(leaf, (ir.Signal, ir.ShiftedSignal)))
     parts = [in_range(name, signature, facts) for name in names if name in facts and name in signature]
     return f": {', '.join(parts)}" if parts else ""
@@ -303,16 +303,16 @@ def in_range(name: str, signature: Signature, ranges: KnownRanges) -> str:
 # ----------------------------------------------------------------------- safety
 
 
-def safety_never_violated(requirement: typed.Requirement, tag: ast.Tag | None) -> Diagnostic | None:
+def safety_never_violated(requirement: typed.Requirement, tag: Span | None) -> Diagnostic | None:
     """Return the warning W502 if no finite prefix of a trace violates a `@safety` requirement, else None.
 
-    The message points to `tag`, the tag `@safety` in the source, unless `tag` is None.
+    The message points to `tag`, the place of the tag `@safety` in the source, unless `tag` is None.
     """
     formula = normal(requirement.formula)
     if "safety" not in requirement.tags or _constrains(formula):
         return None
     culprit = _promise(formula)
-    labels = () if tag is None else (tag.span.label("puts it into phi_safe"),)
+    labels = () if tag is None else (tag.label("puts it into phi_safe"),)
     return Diagnostic(
         "W502",
         "this `@safety` requirement can never constrain the backup policy",

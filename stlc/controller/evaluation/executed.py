@@ -11,7 +11,6 @@ import torch
 from numpy.typing import NDArray
 
 from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import SURPRISE
 from stlc.controller.problem.task import Task
@@ -199,7 +198,7 @@ def _margin(
 
     `end` and `stop` are explained in `stlc.compile.backends.array.graph.evaluate`.
     """
-    (margin,) = evaluate([rule.formula], columns, ops=NUMPY, count=count, end=end, stop=stop)
+    (margin,) = evaluate([rule.formula], columns, count=count, end=end, stop=stop)
     whole = np.broadcast_to(margin, (count, next(iter(columns.values())).shape[1]))
     return np.where(np.isnan(whole), -np.inf, whole)
 

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stlc.compile.frontend.modules import file_of, library_of
 from stlc.compile.pipeline import compile_spec
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.evaluation.causes import Cause, Lost, losses
@@ -22,8 +21,7 @@ from stlc.controller.evaluation.executed import MOST_TIMED
 from stlc.controller.run.run import save_library
 from stlc.diagnostics import Diagnostic, SystemFileError, UsageError
 from stlc.files import File
-from stlc.grammar import ast
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec, file_of
 from stlc.jsontext import Count
 from stlc.monitor.explain.report import explain
 from stlc.monitor.verdict import Monitor
@@ -54,7 +52,7 @@ class Rules:
         overrides: constants that the run or the deployment changes: name -> value as a text.
     """
 
-    spec: ast.Spec
+    spec: Spec
     path: str
     overrides: Mapping[str, str] = field(default_factory=dict)
 
@@ -66,7 +64,7 @@ class Rules:
     @property
     def docs(self) -> dict[str, str]:
         """Comments on the rules: name of a rule -> text of its `##` comment."""
-        rules = (item for item in self.spec.items if isinstance(item, ast.Require))
+        rules = self.spec.requirements.values()
         return {item.name: " ".join((item.doc or "").split()) for item in rules}
 
     @staticmethod
@@ -95,7 +93,7 @@ class Rules:
             spec = read_rules(judge)
             return Rules(spec, str(judge.path), _own(spec, overrides))
         name = entry["file"]
-        spec = parse(folder.source(f"{JUDGE}/{name}"))
+        spec = Spec.parse(folder.source(f"{JUDGE}/{name}"))
         spec = replace(spec, library=folder.library(_library_of(name)))
         return Rules(spec, entry.get("path") or name, _own(spec, overrides))
 
@@ -105,7 +103,7 @@ class Rules:
         Raises:
             SpecError: the rules use names that the system does not have.
         """
-        outside = any(isinstance(item, ast.Extern) for item in self.spec.items)
+        outside = bool(self.spec.functions)
         decl = task.system.decl
         monitor = Monitor(
             self.spec,
@@ -192,7 +190,7 @@ class CopiedRules:
     path: str | None = None
 
 
-def read_rules(judge: JudgeRef) -> ast.Spec:
+def read_rules(judge: JudgeRef) -> Spec:
     """Read the rules (specification of closed-loop runs) that a system file names, with their imports.
 
     Raises:
@@ -200,13 +198,13 @@ def read_rules(judge: JudgeRef) -> ast.Spec:
         SpecError: the file is not a valid specification.
     """
     try:
-        spec = parse(File(judge.path).read(judge.span.source.root))
+        spec = Spec.parse(File(judge.path).read(judge.span.source.root))
     except UsageError as error:
         first = error.diagnostics[0]
         advice = (*first.help, "`--set test.judge=null` does without")
         finding = Diagnostic("S210", first.message, judge.span, label="named here", help=advice)
         raise SystemFileError(finding) from None
-    return replace(spec, library=library_of(spec))
+    return replace(spec, library=spec.imported_texts())
 
 
 def keep_rules(folder: RunDir, task: Task) -> None:
@@ -237,9 +235,9 @@ def _library_of(name: str) -> str:
     return f"{JUDGE}/lib/{file_of(name)}"
 
 
-def _own(spec: ast.Spec, overrides: Mapping[str, str]) -> dict[str, str]:
+def _own(spec: Spec, overrides: Mapping[str, str]) -> dict[str, str]:
     """The entries of `overrides` whose names are constants of the specification `spec`."""
-    own = {item.name for item in spec.items if isinstance(item, (ast.Const, ast.Param))}
+    own = spec.settable
     return {name: text for name, text in overrides.items() if name in own}
 
 

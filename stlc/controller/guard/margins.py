@@ -20,8 +20,6 @@ import torch
 from torch import Tensor
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import add, multiply
-from stlc.compile.ir.traverse import map_children
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import usage
@@ -54,8 +52,8 @@ def with_margins(
     for rule in task.compiled.safety:
         less: ir.Num = ir.Const(margin.get(rule.name, 0.0))
         if (steps := ramp.get(rule.name)) is not None:
-            share = multiply(ir.Signal(ir.ELAPSED), ir.Const(1.0 / steps))
-            less = multiply(less, ir.Op("min", (share, ir.Const(1.0))))
+            share = ir.Signal(ir.ELAPSED) * (1.0 / steps)
+            less = less * share.apply("min", 1.0)
         formula, lowered = tightened(rule.formula, less), tightened(rule.lowered, less)
         safe[rule.name] = replace(rule, formula=formula, lowered=lowered)
     rules = tuple(safe.get(rule.name, rule) for rule in task.rules)
@@ -68,11 +66,11 @@ def tightened(formula: ir.Formula, margin: ir.Num) -> ir.Formula:
     If `margin` is a constant, so is the difference of the robustness of the formulas, for every trajectory.
     """
     if isinstance(formula, ir.Predicate):
-        less: ir.Num = multiply(ir.Const(float(-formula.sign)), margin)
+        less: ir.Num = ir.Const(float(-formula.sign)) * margin
         if isinstance(margin, ir.Const):
             less = ir.Const(-formula.sign * margin.value)
-        return formula if formula.guard else replace(formula, num=add(formula.num, less))
-    return map_children(formula, formulas=lambda part: tightened(part, margin))
+        return formula if formula.guard else replace(formula, num=formula.num + less)
+    return formula.map_children(formulas=lambda part: tightened(part, margin))
 
 
 SHARE = 0.99

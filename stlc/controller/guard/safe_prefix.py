@@ -14,7 +14,6 @@ from torch import Tensor
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import map_children
 
 BEYOND = "#beyond"
 
@@ -29,8 +28,8 @@ def open_ended(formula: ir.Formula) -> ir.Formula:
     negative exactly if the known samples already violate `formula`.
     """
     if isinstance(formula, ir.Predicate):
-        return ir.BoolOp("or", (formula, ir.Predicate(ir.Signal(BEYOND), strict=True, guard=True)))
-    return map_children(formula, formulas=open_ended)
+        return formula | ir.Predicate(ir.Signal(BEYOND), strict=True, guard=True)
+    return formula.map_children(formulas=open_ended)
 
 
 def anchored(formula: ir.Formula) -> ir.Formula:
@@ -39,13 +38,9 @@ def anchored(formula: ir.Formula) -> ir.Formula:
     Example: in `a -> always b`, let `a` depend on the initial state alone. Then `a` is the same for all
     plans. Plans that violate the formula are therefore compared by the robustness of `b`, not by that of `a`.
     """
-    match formula:
-        case ir.Predicate():
-            return replace(formula, guard=True)
-        case ir.BoolOp():
-            return replace(formula, items=tuple(map(anchored, formula.items)))
-        case _:
-            return formula
+    return formula.map_terms(
+        lambda part: replace(part, guard=True) if isinstance(part, ir.Predicate) else part
+    )
 
 
 def robustness_until(

@@ -6,11 +6,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from stlc.compile.frontend.modules import Module, load_modules
 from stlc.diagnostics import StlcError
 from stlc.dynamics.load import load_system_decl
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Module, Spec
 
 
 def input_files(
@@ -28,8 +27,8 @@ def input_files(
     path = File(path).spec()
     found: dict[Path, None] = {path: None}
     with suppress(StlcError):
-        spec = parse(File(path).read())
-        found.update(dict.fromkeys(_imported(load_modules(spec))))
+        spec = Spec.parse(File(path).read())
+        found.update(dict.fromkeys(_imported(spec.modules())))
         if (wanted := system or spec.system) is not None:
             there = File(wanted).system(path)
             found[there] = None
@@ -38,7 +37,7 @@ def input_files(
             found.update(dict.fromkeys(world.path for world in decl.worlds))
             for judge in decl.judges:
                 found[judge.path] = None
-                found.update(dict.fromkeys(_imported(load_modules(parse(File(judge.path).read())))))
+                found.update(dict.fromkeys(_imported(Spec.parse(File(judge.path).read()).modules())))
     return tuple(file for file in found if file.is_file())
 
 

@@ -21,8 +21,7 @@ from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.numbers import Untranslatable, margin_of
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.lower import lower
-from stlc.compile.ir.support import Reach, reach
+from stlc.compile.ir.support import Reach
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -100,20 +99,14 @@ class PendingGoals:
 
 
 def _goal(name: str, formula: typed.Formula, grid: Grid) -> PendingGoal | None:
-    match formula:
-        case typed.Temporal(
-            op="eventually",
-            interval=typed.Interval(clock="start", lo=lo, hi=typed.Time() as hi),
-            body=body,
-        ):
-            lowered = lower(body, grid, [])
-            if reach(lowered) == Reach(0, 0):
-                with suppress(Untranslatable):
-                    return PendingGoal(
-                        name, margin_of(lowered, guarded=True), _steps(lo, grid), _steps(hi, grid)
-                    )
-        case _:
-            pass
+    if formula.word != "eventually" or not formula.on_clock or (window := formula.ahead) is None:
+        return None
+    (body,) = formula.operands
+    lowered = grid.lower(body, [])
+    if window.hi is not None and lowered.reach == Reach(0, 0):
+        with suppress(Untranslatable):
+            margin = margin_of(lowered, guarded=True)
+            return PendingGoal(name, margin, _steps(window.lo, grid), _steps(window.hi, grid))
     return None
 
 

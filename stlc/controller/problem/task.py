@@ -17,10 +17,7 @@ from stlc.compile.backends.c.emit import emit
 from stlc.compile.backends.schedule import End
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.frontend.parameters import fixed
-from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.discretize import Grid
-from stlc.compile.ir.support import columns_in
-from stlc.compile.ir.traverse import is_state, nodes
 from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_spec
 from stlc.compile.semantics.switch import Hard, Switch
 from stlc.compile.semantics.tolerance import TOLERANCE
@@ -31,8 +28,7 @@ from stlc.dynamics.model.cost import PlanCost
 from stlc.dynamics.scenario import scenario_constants
 from stlc.dynamics.system import System, check_plans
 from stlc.files import File
-from stlc.grammar import ast
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.runtime.decision import rank
 from stlc.tabular import html_table
 
@@ -121,7 +117,7 @@ class Task:
         conditions = {
             f"assume {rule.name}": rule.formula
             for rule in compiled.assumptions
-            if is_state(rule.typed.formula) and columns_in(rule.formula) <= known
+            if rule.typed.formula.is_state() and rule.formula.columns <= known
         }
         if conditions:
             system = system.assuming(conditions)
@@ -166,7 +162,7 @@ class Task:
             SystemFileError: the system file is invalid.
         """
         path = File(spec).spec()
-        parsed = parse(File(path).read())
+        parsed = Spec.parse(File(path).read())
         wanted = system if system is not None else parsed.system
         if wanted is None:
             raise usage(f"`{path}` names no system", hint, 'or a line `system "FILE"` in the specification')
@@ -182,7 +178,7 @@ class Task:
     @classmethod
     def of(
         cls,
-        spec: ast.Spec,
+        spec: Spec,
         system: System,
         *,
         overrides: Mapping[str, str] | None = None,
@@ -309,14 +305,15 @@ class Task:
         """Draw `n` random initial states, (n, dim), with the method `System.sample`."""
         return self.system.sample(n, seed=seed, generator=generator, dtype=dtype, device=device)
 
-    def rollout(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
+    def rollout(self, x0: Tensor, u: Tensor, switch: Switch | None = None) -> Tensor:
         """States under plans: (B, n), (B, T, m) -> (B, T+1, n).
 
         `switch` gives the form of jumps and conditions, exact by default. The native kernel is used if no
         gradient is needed and the plans have at most `horizon` steps.
         """
         differentiated = torch.is_grad_enabled() and (x0.requires_grad or u.requires_grad)
-        apart = differentiated or not switch.exact or u.shape[1] > self.horizon
+        soft = switch is not None and not switch.exact
+        apart = differentiated or soft or u.shape[1] > self.horizon
         if apart or not len(x0) or x0.device.type != "cpu" or self.native is None:
             return self.system.rollout(x0, u, switch)
         whole = u.new_zeros((len(u), self.horizon, u.shape[2]))
@@ -421,7 +418,7 @@ class Task:
         return each, {name: torch.cat([part[name] for _, part in parts], 1) for name in self.system.names}
 
     def _judged_by_torch(self, x0: Tensor, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-        columns = self.system.rollout_columns(x0, u, HARD)
+        columns = self.system.rollout_columns(x0, u)
         each = self.graph.per_requirement_columns(columns, ops=TORCH)
         for name in self._moving:
             each = torch.where(columns[name][1:].isnan().any(0)[:, None], torch.nan, each)
@@ -436,17 +433,14 @@ class Task:
     def timed(self) -> Tensor:
         """Mask of the requirements that read clock, statuses or timers, (R,)."""
         return torch.tensor(
-            [
-                any(isinstance(part, ir.Predicate) and part.guard for part in nodes(rule.formula))
-                for rule in self.rules
-            ],
+            [any(each.guard for each in rule.formula.predicates()) for rule in self.rules],
             dtype=torch.bool,
         )
 
     @cached_property
     def _values_of_a_row(self) -> int:
         """Approximate number of values that torch holds per plan while it judges plans."""
-        parts = sum(1 for rule in self.rules for _ in nodes(rule.formula))
+        parts = sum(1 for rule in self.rules for _ in rule.formula.walk())
         return (self.horizon + 1) * (
             2 * len(self.system.names) + 2 * len(self.system.control_names) + 4 * parts
         )

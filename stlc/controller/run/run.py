@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from torch import Tensor, nn
 
-from stlc.compile.frontend.modules import file_of
 from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.controller.run.checkpoint import load_checkpoint, weights
 from stlc.controller.run.config import ResolvedConfig
@@ -16,8 +15,7 @@ from stlc.diagnostics import PluginError, RunError
 from stlc.dynamics.load import load_system_decl
 from stlc.dynamics.scenario import scenario_constants, under
 from stlc.dynamics.system import System
-from stlc.grammar import ast
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec, file_of
 from stlc.plugins import variable
 from stlc.registry import GUARDS, METHODS, PLANNERS, PackageRegistry
 from stlc.rundir import RunDir
@@ -98,9 +96,9 @@ class Run:
             scenario: name of a scenario of the system file to apply.
         """
         trained = folder.record().get("overrides") or {}
-        spec = replace(parse(folder.source(RunDir.SPEC)), library=folder.library())
+        spec = replace(Spec.parse(folder.source(RunDir.SPEC)), library=folder.library())
         decl, changed = Run.declaration_in(folder, overrides, scenario), _changes(folder, overrides, scenario)
-        drawn = {item.name for item in spec.items if isinstance(item, ast.Param)} - trained.keys()
+        drawn = {item.name for item in spec.parameters} - trained.keys()
         values = {name: text for name, text in changed.items() if name in drawn}
         constants = {name: text for name, text in changed.items() if name not in drawn}
         config = folder.read_json(RunDir.CONFIG) if folder.has(RunDir.CONFIG) else {}

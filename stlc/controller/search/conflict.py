@@ -15,11 +15,9 @@ import numpy as np
 import torch
 
 from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import Bounds
 from stlc.compile.ir.ranges import bounds
-from stlc.compile.ir.traverse import map_children, numbers, subexpressions
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
@@ -199,9 +197,9 @@ def _most(formula: ir.Formula, reached: Sequence[Mapping[str, Bounds]]) -> float
                 return ir.Predicate(ir.Signal(name))
             case ir.Freeze(_, body):
                 return bounded(body)
-        return map_children(node, formulas=bounded)
+        return node.map_children(formulas=bounded)
 
-    (most,) = evaluate([bounded(formula)], columns, ops=NUMPY, end="upper")
+    (most,) = evaluate([bounded(formula)], columns, end="upper")
     return float(most.max())
 
 
@@ -210,7 +208,7 @@ def _upper(atom: ir.Predicate, facts: Mapping[str, Bounds]) -> float:
 
     `facts` are the bounds on the states at that instant, by name.
     """
-    if any(isinstance(part, ir.ShiftedSignal) for num in numbers(atom) for part in subexpressions(num)):
+    if atom.shifted:
         return math.inf
     reach = bounds(atom.num, facts)
     if reach is None or any(map(math.isnan, reach)):

@@ -20,7 +20,6 @@ from torch import Tensor
 
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.ir.support import columns_in
 from stlc.controller.problem.native import NativeStep
 from stlc.controller.problem.rows import Rows
 
@@ -141,7 +140,7 @@ class GaussNewton:
         self.task, self.spread = task, spread
         self._conditions = conditions
         names, timers = task.system.names, {timer.name for timer in task.system.timers}
-        read = frozenset().union(*map(columns_in, conditions))
+        read = frozenset().union(*(each.columns for each in conditions))
         self._read = torch.tensor([i for i, name in enumerate(names) if name in read])
         self._scale = self.spread[self._read]
         moving = task.system.exact_step.next.keys() - timers

@@ -13,9 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from stlc.compile.frontend.modules import library_of, spec_sha256
 from stlc.diagnostics import usage
-from stlc.grammar import ast
 from stlc.trace import Reading, Trace, TraceMeta
 from stlc.trace.recording import conversion
 from stlc.version import __version__
@@ -177,8 +175,8 @@ def trace_along(
 def meta_of(task: Task, seed: int | None) -> TraceMeta:
     """Origin of a trace of a task: texts and hashes of its files, and versions."""
     spec, decl = task.compiled.spec, task.system.decl
-    library = library_of(spec)
-    names = {each.name for each in spec.items if isinstance(each, (ast.Const, ast.Param))}
+    library = spec.imported_texts()
+    names = spec.settable
     own = names - {*task.system.names}
     return TraceMeta(
         spec_name=task.compiled.name,
@@ -186,7 +184,7 @@ def meta_of(task: Task, seed: int | None) -> TraceMeta:
         spec_text=spec.source.text,
         spec_library=library,
         spec_set={name: text for name, text in decl.overrides.items() if name in own},
-        spec_hash=spec_sha256(spec.source.text, library),
+        spec_hash=spec.sha256,
         system_name=decl.name,
         system_path=str(decl.path),
         system_text=decl.source.text,

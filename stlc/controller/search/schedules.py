@@ -18,10 +18,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.normal_form import terms
-from stlc.compile.ir.traverse import leaves, map_children, nodes, numbers, operands
 
 Instants = NDArray[np.int64]
 Flags = NDArray[np.bool_]
@@ -121,7 +118,7 @@ class GoalScheduler:
         found = self._depths.get(id(formula))
         if found is None:
             own = isinstance(formula, ir.Windowed) and formula.op in ("eventually", "until", "release")
-            found = self._depths[id(formula)] = own + max(map(self.depth, operands(formula)), default=0)
+            found = self._depths[id(formula)] = own + max(map(self.depth, formula.operands), default=0)
         return found
 
     def decidable(self, formula: ir.Formula) -> bool:
@@ -129,10 +126,10 @@ class GoalScheduler:
         known = self._decidable.get(id(formula))
         if known is None:
             read = (
-                leaf for num in numbers(formula) for leaf in leaves(num) if not isinstance(leaf, ir.Const)
+                leaf for num in formula.numbers() for leaf in num.leaves() if not isinstance(leaf, ir.Const)
             )
             known = self._decidable[id(formula)] = all(
-                isinstance(node, (ir.Truth, ir.Predicate, ir.BoolOp)) for node in nodes(formula)
+                isinstance(node, (ir.Truth, ir.Predicate, ir.BoolOp)) for node in formula.walk()
             ) and all(isinstance(leaf, ir.Signal) and leaf.name in self._states for leaf in read)
         return known
 
@@ -145,16 +142,16 @@ class GoalScheduler:
         left, asked = list(self._formulas), list[ir.Formula]()
         for formula in left:
             if not self.decidable(formula):
-                left.extend(operands(formula))
+                left.extend(formula.operands)
                 if isinstance(formula, ir.Until) or getattr(formula, "op", "") in ("or", "eventually"):
-                    asked.extend(operands(formula))
+                    asked.extend(formula.operands)
         return asked, [self._named(formula) for formula in asked]
 
     def _named(self, formula: ir.Formula) -> ir.Formula:
         if (number := self._numbers.get(formula)) is not None:
             return ir.Predicate(ir.Signal(str(number)))
         if isinstance(formula, (ir.Truth, ir.BoolOp, ir.AtStart, ir.Temporal, ir.Until)):
-            return map_children(formula, formulas=self._named)
+            return formula.map_children(formulas=self._named)
         return ir.Truth(True)
 
     def present(self, formula: ir.Formula) -> Iterator[ir.Formula]:
@@ -173,11 +170,11 @@ class GoalScheduler:
 
     def _collect(self, formula: ir.Formula) -> None:
         if self.decidable(formula):
-            for part in terms(formula, "and"):
+            for part in formula.terms("and"):
                 if not isinstance(part, ir.Truth):
                     self._numbers.setdefault(part, len(self._numbers))
             return
-        for part in operands(formula):
+        for part in formula.operands:
             self._collect(part)
 
 
@@ -342,7 +339,7 @@ class _Drawing:
 
     def _demand(self, formula: ir.Formula, within: Flags) -> None:
         """Demand that a condition holds at samples, (schedules, T + 1)."""
-        for part in terms(formula, "and"):
+        for part in formula.terms("and"):
             if isinstance(part, ir.Truth):
                 self.possible &= part.value | ~within.any(1)
             else:
@@ -371,7 +368,7 @@ class _Nearest(_Drawing):
         super().__init__(scheduler, len(distance), np.random.default_rng(0), None)
         env = {str(i): column.T for i, column in enumerate(distance.swapaxes(0, 1))}
         asked, forms = scheduler.forms
-        worths = evaluate(forms, env, ops=NUMPY, count=self._last + 1, end="truncate") if env else []
+        worths = evaluate(forms, env, count=self._last + 1, end="truncate") if env else []
         shape = self._last + 1, len(distance)
         self._worths = {
             id(one): np.broadcast_to(worth, shape).T for one, worth in zip(asked, worths, strict=True)

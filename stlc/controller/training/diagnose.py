@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from stlc.compile.semantics.switch import Hard
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
 from stlc.controller.training.objective import Objective, rolled, without_lost
@@ -24,7 +23,6 @@ from stlc.dynamics.system import System
 if TYPE_CHECKING:
     from stlc.controller.policies.policy import PlanNetwork
 
-HARD = Hard()
 SHOWN = 6
 """Maximum number of entries of a plan in messages."""
 
@@ -84,7 +82,7 @@ def _plans(step: TrainingStep) -> StlcError | None:
 
 def _motion(step: TrainingStep) -> StlcError | None:
     with torch.no_grad():
-        states = step.task.system.rollout(step.x0, step.u, HARD)
+        states = step.task.system.rollout(step.x0, step.u)
     bad = ~torch.isfinite(states)
     row = _first(bad.flatten(1).any(1))
     if row is None:

@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from stlc.compile.dump import dump
-from stlc.compile.frontend.modules import library_of
 from stlc.controller.evaluation.rules import keep_rules
 from stlc.controller.problem.task import Task
 from stlc.controller.run.config import ResolvedConfig
@@ -81,7 +80,7 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
         }
     )
     folder.write(RunDir.SPEC, task.compiled.spec.source.text)
-    save_library(folder, library_of(task.compiled.spec))
+    save_library(folder, task.compiled.spec.imported_texts())
     folder.write(RunDir.SYSTEM, decl.source.text)
     for path in {world.path for world in decl.worlds if world.path.is_file()}:
         folder.write(path.name, path.read_bytes())

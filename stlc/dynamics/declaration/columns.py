@@ -10,10 +10,9 @@ from fractions import Fraction
 from typing import Protocol, get_args
 
 from stlc.compile.frontend.arithmetic import absolute
-from stlc.compile.frontend.scope import Definition, Known, column_entries, constant_value, member_entries
-from stlc.compile.frontend.values import VectorValue
+from stlc.compile.frontend.scope import Definition, Known, column_entries, member_entries
+from stlc.compile.frontend.values import Number, VectorValue
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import add, multiply
 from stlc.compile.ir.ranges import usual_range
 from stlc.dynamics.declaration.motion import Assign, JumpDecl, shared_draws, state_assigns
 from stlc.dynamics.declaration.schema.expressions import SECOND, written
@@ -139,7 +138,7 @@ def read_time(node: Node | None, cx: Context) -> Clockwork:
     first = node.get("dt") if isinstance(node, Mapping) else None
     silent = replace(cx.here, reader=Reader(cx.reader.source))
     clock = read(Clockwork, replace(cx, dt=silent.duration(first, "`dt`") or cx.dt), node, "`time`")
-    cx.names.entries["dt"] = Known(constant_value(float(clock.dt), SECOND), "the step")
+    cx.names.entries["dt"] = Known(Number.fixed(float(clock.dt), SECOND), "the step")
     return clock
 
 
@@ -153,7 +152,7 @@ def read_constants(node: Node | None, cx: Context) -> None:
         where = f"the constant `{name}`"
         numbers = cx.plain.here.numbers(entry.value, where)
         if numbers is None:
-            names.entries[name] = Known(constant_value(1.0), "constant")
+            names.entries[name] = Known(Number.fixed(1.0), "constant")
             continue
         vector = len(numbers) > 1 or isinstance(entry.value, Sequence)
         called = component_names(name, len(numbers) if vector else None)
@@ -336,9 +335,9 @@ def _timer_flow(name: str, keys: StateKeys, unit: Unit, cx: Context) -> tuple[As
     if run is None:
         return ()
     speed = ir.Const((1.0 if direction == "up" else -1.0) / unit.scale)
-    rate: ir.Num = speed if run == ir.Truth(True) else ir.Op("mul", (speed, ir.Indicator(run)))
+    rate: ir.Num = speed if run.constant else speed * run.indicator()
     if cx.discrete:
-        rate = add(ir.Signal(name), multiply(ir.Const(float(cx.dt)), rate))
+        rate = ir.Signal(name) + ir.Const(float(cx.dt)) * rate
     return (Assign(name, rate, f"timer {direction}"),)
 
 

@@ -17,7 +17,6 @@ from typing import Any
 
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import add, multiply
 from stlc.compile.ir.discretize import Grid
 from stlc.diagnostics import Diagnostic
 from stlc.dynamics.declaration.deployment import BackupDecl, JudgeRef, ScenarioDecl, TestDecl, WorldRef
@@ -200,11 +199,11 @@ class SystemDecl:
             back: ir.Num = ir.Const(0.0)
             for gain, state, at in zip(feedback.gain[i], self.signature.names, feedback.state, strict=True):
                 if gain:
-                    back = add(back, multiply(ir.Const(gain), ir.Op("sub", (ir.Const(at), ir.Signal(state)))))
+                    back = back + ir.Const(gain) * (ir.Const(at) - ir.Signal(state))
             most = feedback.authority[i]
-            bounded = ir.Op("clip", (back, ir.Const(-most), ir.Const(most)))
-            total = add(add(ir.Signal(each.name), ir.Const(feedback.control[i])), bounded)
-            found[each.name] = ir.Op("clip", (total, ir.Const(feedback.low[i]), ir.Const(feedback.high[i])))
+            bounded = back.apply("clip", -most, most)
+            total = ir.Signal(each.name) + feedback.control[i] + bounded
+            found[each.name] = total.apply("clip", feedback.low[i], feedback.high[i])
         return found
 
     def describe(self) -> str:

@@ -8,9 +8,6 @@ from itertools import pairwise
 
 from stlc.compile.frontend.scope import Known, column_value
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import add, multiply, total
-from stlc.compile.ir.support import columns_in
-from stlc.compile.ir.traverse import map_leaves
 from stlc.dynamics.declaration.columns import (
     RANGE,
     declared_columns,
@@ -192,7 +189,7 @@ def _without_controls(cell: _Held, cx: Context) -> _Held:
 
     Values are computed before controls are chosen.
     """
-    read = columns_in(cell.value) | (frozenset() if cell.before is None else columns_in(cell.before))
+    read = cell.value.columns | (frozenset() if cell.before is None else cell.before.columns)
     found = {control.name for control in cx.names.controls} & {name.split(ir.BEFORE)[0] for name in read}
     if not found:
         return cell
@@ -286,7 +283,7 @@ def _varying(delay: DelayEntry, column: Column, present: _Held, cx: Context) -> 
     if by is None:
         return _Delayed()
     dt = float(cx.dt)
-    wait = ir.Op("clip", (by, ir.Const(dt), ir.Const(delay.steps * dt)))
+    wait = by.apply("clip", dt, delay.steps * dt)
     text = f"{present.text}, {written(keys.by)} ago"
     share: ir.Num = ir.Op("div", (ir.Const(dt), wait) if keys.transport else (wait, ir.Const(dt)))
     rate = _Held(
@@ -295,8 +292,8 @@ def _varying(delay: DelayEntry, column: Column, present: _Held, cx: Context) -> 
     count = delay.steps if keys.transport else 0
     read = (*_ago(present, delay.steps), *_ago(rate, count))
     body = _pipe(delay.steps) if keys.transport else _earlier(delay.steps)
-    late, soon = (ir.Extern(f"{column.name}_late", read, index, body) for index in (0, 1))
-    slope: ir.Num = multiply(ir.Op("sub", (soon, late)), ir.Const(1.0 / dt))
+    late, soon = body.calls_of(f"{column.name}_late", read)
+    slope: ir.Num = (soon - late) * (1.0 / dt)
     moves = replace(
         column, name=f"{column.name}_rate", unit=column.unit.interval / SECOND, low=None, high=None
     )
@@ -324,7 +321,7 @@ def _earlier(steps: int) -> ir.Body:
     """
     ways = [(ir.Const(float(k)), ir.Const(1.0)) for k in range(steps)]
     at = ir.Signal("by")
-    targets = (at, ir.Op("sub", (at, ir.Const(1.0))))
+    targets = (at, at - 1.0)
     outputs = tuple(_between(ways, target) for target in targets)
     return ir.Body((*_values(steps), "by"), (), outputs)
 
@@ -341,11 +338,11 @@ def _pipe(steps: int) -> ir.Body:
     ways: list[tuple[ir.Num, ir.Num]] = []
     passed: ir.Num = ir.Const(0.0)
     for k, pair in enumerate(pairwise(speeds)):
-        lets.append((f"way{k}", multiply(ir.Const(0.5), add(*map(ir.Signal, pair)))))
+        lets.append((f"way{k}", 0.5 * (ir.Signal(pair[0]) + ir.Signal(pair[1]))))
         ways.append((passed, ir.Signal(f"way{k}")))
-        lets.append((f"passed{k}", add(*ways[-1])))
+        lets.append((f"passed{k}", ways[-1][0] + ways[-1][1]))
         passed = ir.Signal(f"passed{k}")
-    soon = ir.Op("sub", (ir.Const(1.0), ir.Signal(speeds[0])))
+    soon = 1.0 - ir.Signal(speeds[0])
     outputs = tuple(_between(ways, target) for target in (ir.Const(1.0), soon))
     return ir.Body((*_values(steps), *speeds), tuple(lets), outputs)
 
@@ -363,12 +360,12 @@ def _between(ways: Sequence[tuple[ir.Num, ir.Num]], at: ir.Num) -> ir.Num:
     values = [ir.Signal(name) for name in _values(len(ways))]
     parts: list[ir.Num] = [values[0]]
     for (passed, way), (later, earlier) in zip(ways, pairwise(values), strict=True):
-        share: ir.Num = ir.Op("sub", (at, passed))
+        share: ir.Num = at - passed
         if way != ir.Const(1.0):
-            share = ir.Op("div", (share, way))
-        rise = ir.Op("sub", (earlier, later))
-        parts.append(multiply(rise, ir.Op("clip", (share, ir.Const(0.0), ir.Const(1.0)))))
-    return total(parts)
+            share = share / way
+        rise = earlier - later
+        parts.append(rise * share.apply("clip", 0.0, 1.0))
+    return ir.Num.total(parts)
 
 
 class _Past:
@@ -391,7 +388,7 @@ class _Past:
             name, back = _earlier_name(leaf)
             return self._before(name, cell) if back else leaf
 
-        return map_leaves(cell.value, read)
+        return cell.value.map_leaves(read)
 
     def later(self, cell: _Held) -> ir.Num:
         """Value of a column at a later sample."""
@@ -400,7 +397,7 @@ class _Past:
             name, back = _earlier_name(leaf)
             return self._earlier(name, back, cell) if back else leaf
 
-        return _ticking(cell.every, map_leaves(cell.value, read), cell.column.name)
+        return _ticking(cell.every, cell.value.map_leaves(read), cell.column.name)
 
     def _own(self, every: int, name: str) -> bool:
         """True if the column `name` is held with the same period, so that it is its own latest value."""
@@ -462,6 +459,6 @@ def _ticking(every: int, value: ir.Num, name: str) -> ir.Num:
     """Return `value` at every so many steps, and otherwise the present value of the column `name`."""
     if every == 1:
         return value
-    rest = ir.Op("mod", (ir.Signal(CLOCK), ir.Const(float(every))))
-    due = ir.Predicate(ir.Op("sub", (ir.Const(0.5), rest)))
-    return ir.Where(due, value, ir.Signal(name + ir.BEFORE))
+    rest = ir.Signal(CLOCK) % float(every)
+    due = ir.Predicate(0.5 - rest)
+    return due.select(value, ir.Signal(name + ir.BEFORE))

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias, get_args
 
 from stlc.compile.frontend.scope import Known, column_value
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import add, multiply, substitute, total
 from stlc.dynamics.declaration.columns import RANGE, name_columns, read_ranges, unit_text
 from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.declaration.sampled import CLOCK, Sampled, clock, declared
@@ -298,7 +297,7 @@ def _sampled(decl: InputDecl, entry: Entry, cx: Context) -> Sampled:
     if decl.interpolate != "hold" and not cx.discrete:
         known = column_value(present)
         names.entries[decl.name] = Known(
-            replace(known, num=substitute(known.num, {decl.name: value})), "input signal", span
+            replace(known, num=known.num.substitute({decl.name: value})), "input signal", span
         )
     shown = Assign(decl.name, value, decl.interpolate)
     return Sampled(_draws(decl), (shown,), (shown,) if decl.moves else (), (), decl.columns)
@@ -315,9 +314,9 @@ def _draws(decl: InputDecl) -> tuple[Assign, ...]:
     rest: ir.Num = length
     for index, name in enumerate(decl.times):
         share = ir.Op("uniform", (ir.Const(0.0), ir.Const(1.0)))
-        root = ir.Op("pow", (share, ir.Const(1.0 / (len(decl.times) - index))))
-        found.append(Assign(name, ir.Op("sub", (length, multiply(rest, root))), "sorted uniform times"))
-        rest = ir.Op("sub", (length, ir.Signal(name)))
+        root = share.apply("pow", 1.0 / (len(decl.times) - index))
+        found.append(Assign(name, length - rest * root, "sorted uniform times"))
+        rest = length - ir.Signal(name)
     return tuple(found)
 
 
@@ -326,10 +325,10 @@ def _present(decl: InputDecl, dt: Fraction) -> ir.Num:
     points: list[ir.Num] = [ir.Signal(name) for name in decl.values]
     least = ir.Const(SLACK * float(decl.duration))
     times = [ir.Signal(name) for name in decl.times]
-    now = multiply(ir.Signal(CLOCK), ir.Const(float(dt)))
+    now = ir.Signal(CLOCK) * float(dt)
     if decl.interpolate == "hold":
         if decl.free_times:
-            passed = [_minus(add(now, least), time) for time in times]
+            passed = [_minus(now + least, time) for time in times]
         else:
             instants = (ir.Const(float(math.ceil(end / dt))) for end in decl.ends[1:-1])
             passed = [_minus(ir.Signal(CLOCK), instant) for instant in instants]
@@ -340,19 +339,19 @@ def _present(decl: InputDecl, dt: Fraction) -> ir.Num:
     widths = [_largest(_minus(after, before), least) for before, after in pairwise(ends)]
     unit = (ir.Const(0.0), ir.Const(1.0))
     shares = [
-        ir.Op("clip", (_over(_minus(now, before), width), *unit))
+        (_minus(now, before) / width).apply("clip", *unit)
         for before, width in zip(ends, widths, strict=False)
     ]
     rises = [_minus(after, before) for before, after in pairwise(points)]
     if decl.interpolate == "linear":
-        parts: Sequence[ir.Num] = [multiply(*each) for each in zip(rises, shares, strict=True)]
+        parts: Sequence[ir.Num] = [rise * share for rise, share in zip(rises, shares, strict=True)]
     else:
         slopes = _slopes(rises, widths)
         parts = [
-            _cubic(rise, share, multiply(width, left), multiply(width, right))
+            _cubic(rise, share, width * left, width * right)
             for rise, share, width, (left, right) in zip(rises, shares, widths, pairwise(slopes), strict=True)
         ]
-    return total([points[0], *parts])
+    return ir.Num.total([points[0], *parts])
 
 
 def _piece(points: Sequence[ir.Num], passed: Sequence[ir.Num]) -> ir.Num:
@@ -364,7 +363,7 @@ def _piece(points: Sequence[ir.Num], passed: Sequence[ir.Num]) -> ir.Num:
         return points[0]
     half = len(passed) // 2
     later, earlier = _piece(points[half + 1 :], passed[half + 1 :]), _piece(points[: half + 1], passed[:half])
-    return ir.Where(ir.Predicate(passed[half]), later, earlier)
+    return ir.Predicate(passed[half]).select(later, earlier)
 
 
 def _cubic(rise: ir.Num, share: ir.Num, left: ir.Num, right: ir.Num) -> ir.Num:
@@ -374,51 +373,47 @@ def _cubic(rise: ir.Num, share: ir.Num, left: ir.Num, right: ir.Num) -> ir.Num:
     length.
     """
     rest = _minus(ir.Const(1.0), share)
-    eased = multiply(ir.Op("square", (share,)), _minus(ir.Const(3.0), multiply(ir.Const(2.0), share)))
-    bent = multiply(multiply(share, rest), _minus(multiply(left, rest), multiply(right, share)))
-    return add(multiply(rise, eased), bent)
+    eased = share.apply("square") * _minus(ir.Const(3.0), 2.0 * share)
+    bent = share * rest * _minus(left * rest, right * share)
+    return rise * eased + bent
 
 
 def _slopes(rises: Sequence[ir.Num], widths: Sequence[ir.Num]) -> list[ir.Num]:
     """Return the derivatives at the ends of the pieces, as `pchip_slopes` has them."""
-    means = [_over(rise, width) for rise, width in zip(rises, widths, strict=True)]
+    means = [rise / width for rise, width in zip(rises, widths, strict=True)]
     if len(means) == 1:
         return [means[0], means[0]]
     found = [_end(means[0], means[1], widths[0], widths[1])]
     for (left, right), (before, after) in zip(pairwise(means), pairwise(widths), strict=True):
-        near = add(multiply(ir.Const(2.0), after), before)
-        far = add(after, multiply(ir.Const(2.0), before))
-        below = add(multiply(near, ir.Op("abs", (right,))), multiply(far, ir.Op("abs", (left,))))
-        above = multiply(ir.Op("relu", (multiply(left, right),)), multiply(ir.Const(3.0), add(before, after)))
-        turned = multiply(ir.Op("sign", (left,)), above)
-        found.append(_over(turned, _largest(below, ir.Const(1e-30))))
+        near = 2.0 * after + before
+        far = after + 2.0 * before
+        below = near * right.apply("abs") + far * left.apply("abs")
+        above = (left * right).apply("relu") * (3.0 * (before + after))
+        turned = left.apply("sign") * above
+        found.append(turned / _largest(below, ir.Const(1e-30)))
     return [*found, _end(means[-1], means[-2], widths[-1], widths[-2])]
 
 
 def _end(mean: ir.Num, following: ir.Num, width: ir.Num, next_width: ir.Num) -> ir.Num:
     """Return the derivative at an end, from mean slopes and lengths of the outer piece and the next."""
-    both = add(multiply(ir.Const(2.0), width), next_width)
-    above = _minus(multiply(both, mean), multiply(width, following))
-    parabola = _over(above, add(width, next_width))
-    most = multiply(ir.Const(3.0), mean)
+    both = 2.0 * width + next_width
+    above = _minus(both * mean, width * following)
+    parabola = above / (width + next_width)
+    most = 3.0 * mean
     zero = ir.Const(0.0)
-    bounded = ir.Op("clip", (parabola, ir.Op("min", (zero, most)), ir.Op("max", (zero, most))))
-    same = ir.Predicate(multiply(mean, following), strict=True)
-    ahead = ir.Predicate(multiply(parabola, mean), strict=True)
-    return ir.Where(ahead, ir.Where(same, parabola, bounded), zero)
+    bounded = parabola.apply("clip", zero.apply("min", most), zero.apply("max", most))
+    same = ir.Predicate(mean * following, strict=True)
+    ahead = ir.Predicate(parabola * mean, strict=True)
+    return ahead.select(same.select(parabola, bounded), zero)
 
 
 def _minus(left: ir.Num, right: ir.Num) -> ir.Num:
     if isinstance(left, ir.Const) and isinstance(right, ir.Const):
         return ir.Const(left.value - right.value)
-    return ir.Op("sub", (left, right))
-
-
-def _over(above: ir.Num, below: ir.Num) -> ir.Num:
-    return ir.Op("div", (above, below))
+    return left - right
 
 
 def _largest(left: ir.Num, right: ir.Const) -> ir.Num:
     if isinstance(left, ir.Const):
         return ir.Const(max(left.value, right.value))
-    return ir.Op("max", (left, right))
+    return left.apply("max", right)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import Assignments
+from stlc.dynamics.declaration.assignments import Assignments
 from stlc.files import File, read_regular
 
 Doubles: TypeAlias = NDArray[np.float64]
@@ -191,7 +191,7 @@ def _turned(axis: Doubles, point: Point, angle: ir.Num, writer: Assignments) -> 
         return point
     x, y, z = axis
     aside = _linear(np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]), point)
-    cosine, sine = (writer.name(ir.Op(name, (angle,)), NAME) for name in ("cos", "sin"))
+    cosine, sine = (writer.name(angle.apply(name), NAME) for name in ("cos", "sin"))
     return tuple(
         writer.name(_sum(_sum(kept, _product(cosine, part)), _product(sine, turned)), NAME)
         for kept, part, turned in zip(along, across, aside, strict=True)
@@ -233,11 +233,11 @@ def _sum(left: ir.Num, right: ir.Num) -> ir.Num:
         case (ir.Const(0.0), kept) | (kept, ir.Const(0.0)):
             return kept
         case _, ir.Op("neg", (taken,)):
-            return ir.Op("sub", (left, taken))
+            return left - taken
         case ir.Op("neg", (taken,)), _:
-            return ir.Op("sub", (right, taken))
+            return right - taken
         case _:
-            return ir.Op("add", (left, right))
+            return left + right
 
 
 def _product(left: ir.Num, right: ir.Num) -> ir.Num:
@@ -249,8 +249,8 @@ def _product(left: ir.Num, right: ir.Num) -> ir.Num:
         case (ir.Const(1.0), kept) | (kept, ir.Const(1.0)):
             return kept
         case (ir.Const(-1.0), kept) | (kept, ir.Const(-1.0)):
-            return kept.args[0] if isinstance(kept, ir.Op) and kept.name == "neg" else ir.Op("neg", (kept,))
+            return kept.args[0] if isinstance(kept, ir.Op) and kept.name == "neg" else -kept
         case _, ir.Op("neg", (kept,)):
-            return ir.Op("neg", (_product(left, kept),))
+            return -_product(left, kept)
         case _:
-            return ir.Op("mul", (left, right))
+            return left * right

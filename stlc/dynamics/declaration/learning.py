@@ -10,8 +10,6 @@ from stlc.compile.frontend.arithmetic import absolute
 from stlc.compile.frontend.scope import Entry, Known
 from stlc.compile.frontend.values import Number
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import substitute
-from stlc.compile.ir.support import columns_in
 from stlc.dynamics.declaration.motion import Assign, component_texts, state_assigns
 from stlc.dynamics.declaration.schema.expressions import SECOND, written
 from stlc.dynamics.declaration.schema.names import Context, ControlDecl, each_number
@@ -34,7 +32,6 @@ from stlc.dynamics.declaration.schema.record import (
 )
 from stlc.dynamics.declaration.schema.yaml_nodes import Mapping as MappingNode
 from stlc.dynamics.declaration.schema.yaml_nodes import Node, Scalar
-from stlc.grammar import ast
 from stlc.registry import METHODS
 from stlc.signature import Column
 from stlc.source import Span
@@ -107,8 +104,8 @@ def term_list(cx: Context, node: Node | None, label: str) -> tuple[Term, ...]:
 
 def _at_start(number: Number) -> Number:
     """Replace each state `x` in a number by the column `x_start`, its value at the start of the plan."""
-    table = {name: ir.Signal(name + START) for name in columns_in(number.num)}
-    return replace(number, num=substitute(number.num, table))
+    table = {name: ir.Signal(name + START) for name in number.num.columns}
+    return replace(number, num=number.num.substitute(table))
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,7 +221,7 @@ def _seen(node: Node, cx: Context) -> tuple[tuple[ir.Num, str], ...]:
     for each component; the tuple is empty if the item is invalid.
     """
     expr = cx.here.parse(node, "an observation")
-    if isinstance(expr, ast.Bool | ast.Compare | ast.Not | ast.Logic | ast.Member):
+    if expr is not None and expr.is_formula:
         value = cx.here.truth(node, "an observation")
         return () if value is None else ((value, written(node)),)
     numbers = None if expr is None else cx.here.numbers(node, "an observation")

@@ -11,9 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import map_parts
 from stlc.compile.ir.functions import sampler_names
-from stlc.compile.ir.traverse import subexpressions
 from stlc.dynamics.declaration.schema.expressions import SECOND, written
 from stlc.dynamics.declaration.schema.names import Context
 from stlc.dynamics.declaration.schema.reader import first_line
@@ -220,9 +218,9 @@ def read_jumps(node: Node | None, cx: Context) -> tuple[JumpDecl, ...]:
             _check_located(item, cx)
         if jump.once:
             latch = latch_name(jump.name)
-            open_ = ir.Predicate(ir.Op("sub", (ir.Const(0.5), ir.Signal(latch))))
+            open_ = ir.Predicate(0.5 - ir.Signal(latch))
             resets = (*jump.resets, Assign(latch, ir.Const(1.0), "true"))
-            jump = replace(jump, guard=ir.BoolOp("and", (jump.guard, open_)), resets=resets)
+            jump = replace(jump, guard=jump.guard & open_, resets=resets)
         found.append(jump)
     return tuple(found)
 
@@ -284,7 +282,7 @@ def shared_draws(assigns: Sequence[Assign]) -> tuple[Assign, ...]:
         for assign in assigns
         for draw in {
             id(part)
-            for part in subexpressions(assign.value)
+            for part in assign.value.subexpressions()
             if isinstance(part, ir.Op) and part.name in _SAMPLERS
         }
     )
@@ -297,7 +295,7 @@ def shared_draws(assigns: Sequence[Assign]) -> tuple[Assign, ...]:
     def rewritten(num: ir.Num) -> ir.Num:
         """Return the number with each sampler that is drawn once replaced by the local name of its value."""
         if id(num) not in known:
-            changed = map_parts(num, rewritten)
+            changed = num.map_parts(rewritten)
             if id(num) in shared:
                 before.append(Assign(f"{assigns[0].name}#{len(before)}", changed))
                 changed = ir.Signal(before[-1].name)

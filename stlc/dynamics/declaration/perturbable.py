@@ -13,8 +13,6 @@ from functools import partial
 from stlc.compile.frontend.scope import Entry, Known
 from stlc.compile.frontend.values import Number
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import multiply
-from stlc.compile.ir.support import columns_in
 from stlc.diagnostics import SystemFileError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.motion import Assign
@@ -81,7 +79,7 @@ def perturbable(decl: SystemDecl) -> Perturbable:
             worth = [value for name, (value, _) in decl.constants.items() if base_name(name) == number.text]
             if not number.states or not any(worth):
                 raise _without_effect(number, found, decl)
-    late = any(texts.keys() & columns_in(each.value) for each in started)
+    late = any(texts.keys() & each.value.columns for each in started)
     return Perturbable(
         replace(factored, init=decl.init),
         tuple(each for each in numbers if each.states),
@@ -138,10 +136,10 @@ def _readers(decl: SystemDecl) -> Mapping[str, dict[str, None]]:
     guard or its reset.
     """
     found: defaultdict[str, dict[str, None]] = defaultdict(dict)
-    read = [(each.name, columns_in(each.value)) for each in (*decl.flow, *decl.updates, *decl.init.computed)]
+    read = [(each.name, each.value.columns) for each in (*decl.flow, *decl.updates, *decl.init.computed)]
     for jump in decl.jumps:
-        guard = columns_in(jump.guard)
-        read += [(each.name, guard | columns_in(each.value)) for each in jump.resets]
+        guard = jump.guard.columns
+        read += [(each.name, guard | each.value.columns) for each in jump.resets]
     for name, columns in read:
         for column in columns:
             found[column][base_name(name)] = None
@@ -171,4 +169,4 @@ def _scaled(number: Number, factor: ir.Num) -> Number:
     """Multiply a number by a factor; one on a scale such as degC has no relative error and stays as it is."""
     if number.unit.offset:
         return number
-    return replace(number, num=multiply(number.num, factor), exact=None)
+    return replace(number, num=number.num * factor, exact=None)

@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import add
-from stlc.compile.ir.support import columns_in
 from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.declaration.schema.names import Context
 from stlc.signature import Column
@@ -75,7 +73,7 @@ def clock(cx: Context, span: Span, *, flows: bool) -> Sampled:
     if column in cx.names.columns:
         return Sampled()
     declared(cx, column, span)
-    start, later = Assign(CLOCK, ir.Const(0.0), "0"), add(ir.Signal(CLOCK + ir.BEFORE), ir.Const(1.0))
+    start, later = Assign(CLOCK, ir.Const(0.0), "0"), ir.Signal(CLOCK + ir.BEFORE) + 1.0
     rate = (Assign(CLOCK, ir.Const(float(1 / cx.dt)), "1 / dt"),) if flows and not cx.discrete else ()
     return Sampled((start,), (), (Assign(CLOCK, later, "samples"),), rate, (CLOCK,))
 
@@ -86,7 +84,7 @@ def in_order(assigns: Iterable[Assign], cx: Context) -> tuple[Assign, ...]:
     S202 is reported if values depend on each other at the same sample.
     """
     known = {assign.name: assign for assign in assigns}
-    reads = {name: columns_in(assign.value) & known.keys() for name, assign in known.items()}
+    reads = {name: assign.value.columns & known.keys() for name, assign in known.items()}
     try:
         return tuple(known[name] for name in TopologicalSorter(reads).static_order())
     except CycleError as error:

@@ -10,7 +10,6 @@ from pathlib import Path
 from types import MappingProxyType
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import columns_in
 from stlc.diagnostics import StlcError, SystemFileError
 from stlc.dynamics.declaration.columns import (
     Clockwork,
@@ -270,7 +269,7 @@ def _report_idle(
 ) -> None:
     """Report W603 for controls that neither `flow` nor a jump reads; `node` is the section `control`."""
     moved = [assign.value for assign in (*flow, *(reset for jump in jumps for reset in jump.resets))]
-    used = {name for num in (*moved, *(jump.guard for jump in jumps)) for name in columns_in(num)}
+    used = {name for num in (*moved, *(jump.guard for jump in jumps)) for name in num.columns}
     known = {entry.key.text: entry.key.span for entry in cx.reader.entries(node, "`control`")}
     for control in cx.names.controls:
         base = base_name(control.name)

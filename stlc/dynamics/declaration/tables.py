@@ -10,8 +10,6 @@ from typing import Literal, TypeAlias, get_args
 
 from stlc.compile.frontend.scope import External
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import multiply, total
-from stlc.compile.ir.support import columns_in
 from stlc.dynamics.declaration.columns import unit_text
 from stlc.dynamics.declaration.schema.names import Context
 from stlc.dynamics.declaration.schema.reader import first_line
@@ -104,7 +102,7 @@ def _table(entry: Entry, cx: Context) -> TableDecl | None:
     table = TableDecl(entry.key.text, units, keys.unit, points, values, keys.extrapolate)
     if not _sound(table, keys, cx):
         return None
-    factors = tuple(sorted({name for row in numbers for number in row for name in columns_in(number)}))
+    factors = tuple(sorted({name for row in numbers for number in row for name in number.columns}))
     cx.names.entries[table.name] = External(
         table.name,
         (None,) * len(points),
@@ -205,14 +203,14 @@ def body(table: TableDecl, values: Sequence[Sequence[ir.Num]], read: Sequence[st
         unit, points = table.units[number], table.points[number]
         argument: ir.Num = ir.Signal(f"at{number}")
         if unit.ratio != 1:
-            argument = multiply(argument, ir.Const(1.0 / unit.scale))
+            argument = argument * (1.0 / unit.scale)
         found: list[ir.Num] = []
         for cell, (left, right) in enumerate(pairwise(points)):
-            share: ir.Num = multiply(ir.Op("sub", (argument, ir.Const(left))), ir.Const(1.0 / (right - left)))
+            share: ir.Num = (argument - left) * (1.0 / (right - left))
             if cell > 0 or table.extrapolate != "linear":
-                share = ir.Op("max", (share, ir.Const(0.0)))
+                share = share.apply("max", 0.0)
             if cell < len(points) - 2 or table.extrapolate != "linear":
-                share = ir.Op("min", (share, ir.Const(1.0)))
+                share = share.apply("min", 1.0)
             lets.append((f"share{number}.{cell}", share))
             found.append(ir.Signal(lets[-1][0]))
         return found
@@ -234,6 +232,6 @@ def _along(values: Sequence[ir.Num], shares: Sequence[ir.Num]) -> ir.Num:
         if isinstance(left, ir.Const) and isinstance(right, ir.Const):
             rise: ir.Num = ir.Const(right.value - left.value)
         else:
-            rise = ir.Op("sub", (right, left))
-        parts.append(multiply(rise, share))
-    return total(parts)
+            rise = right - left
+        parts.append(rise * share)
+    return ir.Num.total(parts)

@@ -28,7 +28,6 @@ from stlc.dynamics.declaration.schema.yaml_nodes import Sequence as ListNode
 from stlc.dynamics.declaration.sections import SystemKeys, motion_of
 from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
-from stlc.grammar.traverse import children, descendants
 from stlc.source import Source, Span
 from stlc.units import Unit
 
@@ -202,7 +201,7 @@ def _names_read(text: str) -> frozenset[str]:
         expr = parse_expr(Source("", text), 0, len(text))
     except StlcError:  # a word of the format, or text
         return frozenset()
-    return frozenset(part.name for part in descendants(expr) if isinstance(part, ast.Name))
+    return frozenset(part.name for part in expr.walk() if isinstance(part, ast.Name))
 
 
 def _with_sources(names: Iterable[str], reads: Mapping[str, frozenset[str]]) -> frozenset[str]:
@@ -301,14 +300,14 @@ class NumbersInUse:
             done |= set(map(id, parts))
             again = tuple(self.rewritten(part, called=inside) for part in parts)
             changed[field] = again if isinstance(value, tuple) else again[0]
-        for part in children(node):
+        for part in node.children():
             if id(part) not in done:
                 self._compare(part)
         return replace(node, **changed)
 
     def _compare(self, part: ast.Node) -> None:
         """Record the constants in `part`, a condition, an exponent or an index; they count as exact."""
-        for node in descendants(part):
+        for node in part.walk():
             if isinstance(node, ast.Name):
                 found = self.names.entries.get(node.name)
                 self.compared |= {node.name} & self.constants

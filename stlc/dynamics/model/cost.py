@@ -67,7 +67,7 @@ class PlanCost:
         """Add `weight` times the mean over time of an expression; nothing for None."""
         if number is None:
             return self
-        value = REDUCED if weight == 1.0 else ir.Op("mul", (ir.Const(weight), REDUCED))
+        value = REDUCED if weight == 1.0 else ir.Const(weight) * REDUCED
         return self._with(CostTerm(number, controlled=controlled, value=value))
 
     def with_shortfall(self, gamma: float, weight: float) -> PlanCost:
@@ -96,12 +96,12 @@ class PlanCost:
             gamma: margin that plans should have.
             weight: factor.
         """
-        since = ir.Predicate(ir.Op("sub", (ir.Signal(clock), ir.Const(times[0]))))
-        until = ir.Predicate(ir.Op("sub", (ir.Const(times[1]), ir.Signal(clock))))
-        counted = ir.Where(ir.BoolOp("and", (since, until)), margin, ir.Const(-math.inf))
-        size = ir.Op("abs", (ir.Signal(status + START),))
-        pending = ir.Predicate(ir.Op("sub", (ir.Const(HELD), size)), strict=True)
-        value = ir.Where(pending, _lack(gamma, weight), ir.Const(0.0))
+        since = ir.Predicate(ir.Signal(clock) - times[0])
+        until = ir.Predicate(ir.Const(times[1]) - ir.Signal(clock))
+        counted = (since & until).select(margin, -math.inf)
+        size = ir.Signal(status + START).apply("abs")
+        pending = ir.Predicate(ir.Const(HELD) - size, strict=True)
+        value = pending.select(_lack(gamma, weight), 0.0)
         return self._with(CostTerm(counted, greatest=True, value=value))
 
     def _with(self, term: CostTerm) -> PlanCost:
@@ -147,5 +147,5 @@ class PlanCost:
 
 def _lack(gamma: float, weight: float) -> ir.Num:
     """`weight` times what `REDUCED` is below gamma, at most gamma."""
-    lack = ir.Op("clip", (ir.Op("sub", (ir.Const(gamma), REDUCED)), ir.Const(0.0), ir.Const(gamma)))
-    return ir.Op("mul", (ir.Const(weight), lack))
+    lack = (ir.Const(gamma) - REDUCED).apply("clip", 0.0, gamma)
+    return ir.Const(weight) * lack

@@ -13,8 +13,6 @@ from types import MappingProxyType
 from typing import TypeAlias
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import add, multiply, total
-from stlc.compile.ir.support import columns_in
 
 Partials: TypeAlias = Callable[..., Sequence[ir.Num | None]]
 """The partial derivatives of a function, from its result and its arguments; None for 0."""
@@ -29,7 +27,7 @@ def derivative(num: ir.Num, of: str) -> ir.Num | None:
 
 def _along(num: ir.Num, slopes: Mapping[str, ir.Num]) -> ir.Num | None:
     """Derivative of an expression, given those of the names in it; names without one are constants."""
-    if not columns_in(num) & slopes.keys():
+    if not num.columns & slopes.keys():
         return None
     match num:
         case ir.Signal(name):
@@ -55,14 +53,14 @@ def _choice(cond: ir.Formula, yes: ir.Num | None, no: ir.Num | None) -> ir.Num |
     """Derivative of a choice, given those of its branches."""
     if yes is None and no is None:
         return None
-    return ir.Where(cond, yes or ir.Const(0.0), no or ir.Const(0.0))
+    return cond.select(yes or ir.Const(0.0), no or ir.Const(0.0))
 
 
 def _extreme(name: str, args: Sequence[ir.Num], slopes: Mapping[str, ir.Num]) -> ir.Num | None:
     """Derivative of `min` or `max`: that of the first argument that is extreme."""
     best, found = args[0], _along(args[0], slopes)
     for arg in args[1:]:
-        gap = _less(best, arg) if name == "max" else _less(arg, best)
+        gap = best - arg if name == "max" else arg - best
         found = _choice(ir.Predicate(gap), found, _along(arg, slopes))
         best = _call(name, best, arg)
     return found
@@ -77,7 +75,7 @@ def _chain(
         for partial, slope in zip(partials, (_along(arg, slopes) for arg in args), strict=True)
         if partial is not None and slope is not None
     ]
-    return total(parts) if parts else None
+    return ir.Num.total(parts) if parts else None
 
 
 def _slope_of(call: ir.Extern, index: int) -> ir.Num | None:
@@ -106,19 +104,7 @@ def _slope_of(call: ir.Extern, index: int) -> ir.Num | None:
 def _product(left: ir.Num, right: ir.Num) -> ir.Num:
     if left == ir.Const(1.0):
         return right
-    return left if right == ir.Const(1.0) else multiply(left, right)
-
-
-def _over(above: ir.Num, below: ir.Num) -> ir.Num:
-    return ir.Op("div", (above, below))
-
-
-def _neg(num: ir.Num) -> ir.Num:
-    return ir.Op("neg", (num,))
-
-
-def _less(left: ir.Num, right: ir.Num) -> ir.Num:
-    return ir.Op("sub", (left, right))
+    return left if right == ir.Const(1.0) else left * right
 
 
 def _call(name: str, *args: ir.Num) -> ir.Num:
@@ -126,20 +112,18 @@ def _call(name: str, *args: ir.Num) -> ir.Num:
 
 
 def _power(result: ir.Num, base: ir.Num, exponent: ir.Num) -> Sequence[ir.Num | None]:
-    one_less = (
-        ir.Const(exponent.value - 1.0) if isinstance(exponent, ir.Const) else _less(exponent, ir.Const(1.0))
-    )
-    by_base = multiply(exponent, _call("pow", base, one_less))
-    return by_base, multiply(result, _call("log", _call("max", base, ir.Const(SMALL))))
+    one_less = ir.Const(exponent.value - 1.0) if isinstance(exponent, ir.Const) else exponent - 1.0
+    by_base = exponent * _call("pow", base, one_less)
+    return by_base, result * _call("log", _call("max", base, ir.Const(SMALL)))
 
 
 def _arc_tangent(_result: ir.Num, y: ir.Num, x: ir.Num) -> Sequence[ir.Num | None]:
-    size = _call("max", add(_call("square", x), _call("square", y)), ir.Const(SMALL))
-    return _over(x, size), _neg(_over(y, size))
+    size = _call("max", _call("square", x) + _call("square", y), ir.Const(SMALL))
+    return x / size, -(y / size)
 
 
 def _root(num: ir.Num) -> ir.Num:
-    return _call("sqrt", _call("max", _less(ir.Const(1.0), _call("square", num)), ir.Const(SMALL)))
+    return _call("sqrt", _call("max", 1.0 - _call("square", num), ir.Const(SMALL)))
 
 
 def _one(slope: Callable[[ir.Num, ir.Num], ir.Num]) -> Partials:
@@ -148,7 +132,7 @@ def _one(slope: Callable[[ir.Num, ir.Num], ir.Num]) -> Partials:
 
 
 def _norm(result: ir.Num, *args: ir.Num) -> Sequence[ir.Num | None]:
-    return [_over(arg, _call("max", result, ir.Const(SMALL))) for arg in args]
+    return [arg / _call("max", result, ir.Const(SMALL)) for arg in args]
 
 
 _ONE = ir.Const(1.0)
@@ -158,25 +142,25 @@ _PARTIALS: Mapping[str, Partials] = MappingProxyType(
         "sub": lambda _, _a, _b: (_ONE, ir.Const(-1.0)),
         "neg": lambda _, _a: (ir.Const(-1.0),),
         "mul": lambda _, a, b: (b, a),
-        "div": lambda r, _, b: (_over(_ONE, b), _neg(_over(r, b))),
-        "mod": lambda _, a, b: (_ONE, _neg(_call("floor", _over(a, b)))),
+        "div": lambda r, _, b: (_ONE / b, -(r / b)),
+        "mod": lambda _, a, b: (_ONE, -_call("floor", a / b)),
         "pow": _power,
-        "square": _one(lambda _, x: multiply(ir.Const(2.0), x)),
+        "square": _one(lambda _, x: 2.0 * x),
         "abs": _one(lambda _, x: _call("sign", x)),
-        "relu": _one(lambda _, x: ir.Where(ir.Predicate(x), _ONE, ir.Const(0.0))),
-        "sqrt": _one(lambda r, _: _over(ir.Const(0.5), _call("max", r, ir.Const(SMALL)))),
+        "relu": _one(lambda _, x: ir.Predicate(x).select(_ONE, 0.0)),
+        "sqrt": _one(lambda r, _: 0.5 / _call("max", r, ir.Const(SMALL))),
         "exp": _one(lambda r, _: r),
-        "log": _one(lambda _, x: _over(_ONE, x)),
-        "log10": _one(lambda _, x: _over(ir.Const(1.0 / math.log(10.0)), x)),
+        "log": _one(lambda _, x: _ONE / x),
+        "log10": _one(lambda _, x: ir.Const(1.0 / math.log(10.0)) / x),
         "sin": _one(lambda _, x: _call("cos", x)),
-        "cos": _one(lambda _, x: _neg(_call("sin", x))),
-        "tan": _one(lambda r, _: add(_ONE, _call("square", r))),
+        "cos": _one(lambda _, x: -_call("sin", x)),
+        "tan": _one(lambda r, _: _ONE + _call("square", r)),
         "sinh": _one(lambda _, x: _call("cosh", x)),
         "cosh": _one(lambda _, x: _call("sinh", x)),
-        "tanh": _one(lambda r, _: _less(_ONE, _call("square", r))),
-        "asin": _one(lambda _, x: _over(_ONE, _root(x))),
-        "acos": _one(lambda _, x: _neg(_over(_ONE, _root(x)))),
-        "atan": _one(lambda _, x: _over(_ONE, add(_ONE, _call("square", x)))),
+        "tanh": _one(lambda r, _: _ONE - _call("square", r)),
+        "asin": _one(lambda _, x: _ONE / _root(x)),
+        "acos": _one(lambda _, x: -(_ONE / _root(x))),
+        "atan": _one(lambda _, x: _ONE / (_ONE + _call("square", x))),
         "atan2": _arc_tangent,
         "norm": _norm,
         "norm1": lambda _, *xs: [_call("sign", x) for x in xs],

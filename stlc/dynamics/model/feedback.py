@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from stlc.compile.backends.array.arith import ArrayProgram
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.diagnostics import Diagnostic
 from stlc.dynamics.declaration.learning import Feedback, FeedbackDecl
 from stlc.dynamics.model.step import build_step
@@ -191,8 +190,8 @@ def _stepped(decl: SystemDecl, points: Doubles) -> Doubles:
     step = build_step(replace(decl, feedback=None, clamps={}, jumps=()), soft=False)
     env = dict(zip(names, points.T, strict=True))
     for name, value in step.lets:
-        env[name] = ArrayProgram({name: value})(env, NUMPY)[name]
-    moved = ArrayProgram(dict(step.next))(env, NUMPY) if step.next else {}
+        env[name] = ArrayProgram({name: value})(env)[name]
+    moved = ArrayProgram(dict(step.next))(env) if step.next else {}
     return np.stack(
         [np.broadcast_to(moved.get(name, env[name]), len(points)) for name in decl.signature.names], 1
     )

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import Assignments, add, multiply, substitute
-from stlc.compile.ir.support import columns_in
+from stlc.dynamics.declaration.assignments import Assignments
 from stlc.dynamics.declaration.motion import JumpDecl
 from stlc.dynamics.model.integrators._tableau import Method, Rate, State
 
@@ -54,7 +53,7 @@ class LocatedJumps:
             at = self._first(segment, waiting)
             there = self._named(segment.at(at, segment.moving))
             state = self._named(self.happened(there, self._due(there, waiting)))
-            rest = self.writer.name(multiply(rest, ir.Op("sub", (_ONE, at))), "rest#{}")
+            rest = self.writer.name(rest * (_ONE - at), "rest#{}")
             if index < ROUNDS - 1:
                 waiting = self._still(there, state)
         return self._named(integrate(_scaled(rate, rest), state, length, self._named))
@@ -63,21 +62,21 @@ class LocatedJumps:
         return {name: self.writer.name(num, name + "#{}") for name, num in state.items()}
 
     def _guards(self, state: State) -> Formulas:
-        return tuple(substitute(jump.guard, state) for jump in self.jumps)
+        return tuple(jump.guard.substitute(state) for jump in self.jumps)
 
     def _due(self, state: State, waiting: Formulas | None) -> Formulas:
         """Conditions under which each jump happens in a state: its guard holds, and it does not wait."""
         if waiting is None:
             return self._guards(state)
         pairs = zip(self._guards(state), waiting, strict=True)
-        return tuple(ir.BoolOp("and", (guard, free)) for guard, free in pairs)
+        return tuple(guard & free for guard, free in pairs)
 
     def _still(self, before: State, after: State) -> Formulas:
         """Conditions that the guard of each jump does not hold both before and after the jumps."""
         found: list[ir.Formula] = []
         for pair in zip(self._guards(before), self._guards(after), strict=True):
-            flag = self.writer.name(ir.Indicator(ir.BoolOp("and", pair)), "waits#{}")
-            found.append(ir.Predicate(ir.Op("sub", (ir.Const(0.5), flag))))
+            flag = self.writer.name(ir.BoolOp("and", pair).indicator(), "waits#{}")
+            found.append(ir.Predicate(0.5 - flag))
         return tuple(found)
 
     def _first(self, segment: _Segment, waiting: Formulas | None) -> ir.Num:
@@ -88,18 +87,18 @@ class LocatedJumps:
         low: ir.Num = _ZERO
         high: ir.Num = _ONE
         for _ in range(HALVINGS):
-            middle = self.writer.name(multiply(ir.Const(0.5), add(low, high)), "middle#{}")
+            middle = self.writer.name(0.5 * (low + high), "middle#{}")
             holds = self._any(segment, middle, waiting)
             low, high = (
-                self.writer.name(ir.Where(holds, *pair), "bracket#{}")
+                self.writer.name(holds.select(*pair), "bracket#{}")
                 for pair in ((low, middle), (middle, high))
             )
-        found = ir.Where(self._any(segment, _ONE, waiting), high, _ONE)
-        return self.writer.name(ir.Where(self._any(segment, _ZERO, waiting), _ZERO, found), "event#{}")
+        found = self._any(segment, _ONE, waiting).select(high, _ONE)
+        return self.writer.name(self._any(segment, _ZERO, waiting).select(_ZERO, found), "event#{}")
 
     def _any(self, segment: _Segment, share: ir.Num, waiting: Formulas | None) -> ir.Formula:
         """Condition that a jump happens after a share of a segment."""
-        read = frozenset[str]().union(*(columns_in(jump.guard) for jump in self.jumps))
+        read = frozenset[str]().union(*(jump.guard.columns for jump in self.jumps))
         due = self._due(self._named(segment.at(share, read & segment.moving)), waiting)
         return due[0] if len(due) == 1 else ir.BoolOp("or", due)
 
@@ -127,9 +126,9 @@ class _Segment:
         last = rate(end)
         bends = {}
         for name in first:
-            change = ir.Op("sub", (end[name], start[name]))
-            ways = (multiply(ir.Const(length), slope[name]) for slope in (first, last))
-            left, right = (ir.Op("sub", (way, change)) for way in ways)
+            change = end[name] - start[name]
+            ways = (ir.Const(length) * slope[name] for slope in (first, last))
+            left, right = (way - change for way in ways)
             kept = named({f"{name}.left": left, f"{name}.right": right})
             bends[name] = kept[f"{name}.left"], kept[f"{name}.right"]
         return cls(start, end, bends)
@@ -145,13 +144,13 @@ class _Segment:
             return self.start
         if share == _ONE:
             return {**self.start, **{name: self.end[name] for name in names}}
-        rest = ir.Op("sub", (_ONE, share))
+        rest = _ONE - share
         found = dict(self.start)
         for name in names:
             left, right = self.bends[name]
-            change = ir.Op("sub", (self.end[name], self.start[name]))
-            bent = ir.Op("sub", (multiply(rest, left), multiply(share, right)))
-            found[name] = add(self.start[name], multiply(share, add(change, multiply(rest, bent))))
+            change = self.end[name] - self.start[name]
+            bent = rest * left - share * right
+            found[name] = self.start[name] + share * (change + rest * bent)
         return found
 
 
@@ -159,4 +158,4 @@ def _scaled(rate: Rate, share: ir.Num) -> Rate:
     """Return the derivatives in a time that runs `share` times as fast."""
     if share == _ONE:
         return rate
-    return lambda state: {name: multiply(share, slope) for name, slope in rate(state).items()}
+    return lambda state: {name: share * slope for name, slope in rate(state).items()}

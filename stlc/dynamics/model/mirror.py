@@ -13,7 +13,6 @@ from torch import Tensor
 
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.semantics.switch import Hard
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -21,8 +20,6 @@ if TYPE_CHECKING:
     from stlc.compile.namespace import Ops
     from stlc.dynamics.declaration.motion import Assign
     from stlc.dynamics.declaration.schema.names import ControlDecl
-
-HARD = Hard()
 
 
 class Mirror:
@@ -63,11 +60,11 @@ class Mirror:
 
     def image_of_states(self, states: Mapping[str, Any], ops: Ops) -> dict[str, Any]:
         """Return the states that the mirror changes, over any array library: name -> array."""
-        return self._states(states, ops, HARD) if self._states.columns else {}
+        return self._states(states, ops) if self._states.columns else {}
 
     def image_of_controls(self, controls: Mapping[str, Any], ops: Ops) -> dict[str, Any]:
         """Return the controls that the mirror changes, over any array library, without wrapping angles."""
-        return self._inputs(controls, ops, HARD) if self._inputs.columns else {}
+        return self._inputs(controls, ops) if self._inputs.columns else {}
 
     def fold(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Map states (B, n) to their representatives (B, n).
@@ -86,5 +83,5 @@ def _applied(program: ArrayProgram, x: Tensor, names: Sequence[str]) -> Tensor:
     `names` are the names of all k columns.
     """
     columns = dict(zip(names, x.unbind(-1), strict=True))
-    images = program(columns, TORCH, HARD) if program.columns else {}
+    images = program(columns, TORCH) if program.columns else {}
     return torch.stack([images.get(name, column) for name, column in columns.items()], -1)

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from stlc.compile.backends.array.arith import ArrayProgram
-from stlc.compile.ir.support import columns_in
 from stlc.compile.namespace import Array, Ops
 from stlc.compile.semantics.switch import Switch
 from stlc.dynamics.model.schedule import RolloutStage, blocks, schedule
@@ -51,7 +50,7 @@ class _Stage:
         self.early = ArrayProgram(stage.early) if stage.early else None
         self.blocks = tuple(map(ArrayProgram, stage.blocks))
         inside = stage.stepped.keys() | {name for block in stage.blocks for name in block}
-        read = {name for block in stage.blocks for num in block.values() for name in columns_in(num)}
+        read = {name for block in stage.blocks for num in block.values() for name in num.columns}
         self.outside = sorted(read - inside)
 
     def __call__(self, rollout: _Rollout) -> None:

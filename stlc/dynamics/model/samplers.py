@@ -19,10 +19,8 @@ from torch import Tensor
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import map_parts
 from stlc.compile.ir.functions import sampler_names
 from stlc.compile.namespace import Array, Ops
-from stlc.compile.semantics.switch import Hard
 from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
 from stlc.dynamics.declaration.init import FileDecl, GridDecl, InitDecl, Situation
 from stlc.dynamics.declaration.motion import Assign
@@ -34,7 +32,6 @@ from stlc.trace.recording import Recording, conversion
 Draw: TypeAlias = Callable[[str, list[Any]], Array]
 """Function from the name of a sampler, such as `uniform`, and its arguments to its value."""
 
-_HARD = Hard()
 _SAMPLERS = frozenset(sampler_names())
 _FAR = 6.0
 """Deviations from the mean beyond which `truncnorm` computes with logarithms of probabilities."""
@@ -140,9 +137,9 @@ class Drawing:
         if self._calls:
             env = dict(env)
             for call in self._calls:
-                args = call.args(env, ops, _HARD)
+                args = call.args(env, ops)
                 env[call.name] = draw(call.sampler, [args[str(i)] for i in range(call.arity)])
-        return self._program(env, ops, _HARD)[self.name]
+        return self._program(env, ops)[self.name]
 
     @property
     def samplers(self) -> frozenset[str]:
@@ -169,7 +166,7 @@ class Drawing:
             self._calls.append(_Call(name, num.name, ArrayProgram(args), len(args)))
             found: ir.Num = ir.Signal(name)
         else:
-            found = map_parts(num, self._extract)
+            found = num.map_parts(self._extract)
         self._seen[id(num)] = found
         return found
 
@@ -296,7 +293,7 @@ class InitialStates:
         self._mixture = _Mixture(decl.mixture)
         self._override = tuple(Drawing(assign) for assign in decl.override)
         self._computed = tuple(Drawing(assign) for assign in decl.computed)
-        self._where = ArrayProgram({f"{i}": ir.Indicator(cond) for i, cond in enumerate(decl.where)})
+        self._where = ArrayProgram({f"{i}": cond.indicator() for i, cond in enumerate(decl.where)})
 
     @property
     def acceptance(self) -> float:
@@ -353,7 +350,7 @@ class InitialStates:
     def _each_holds(self, states: Tensor) -> Tensor:
         """Mask (conditions, n): whether each of the states (n, dim) meets each condition of `where`."""
         env = dict(zip(self.names, states.unbind(1), strict=True))
-        marks = self._where(env, TORCH, _HARD)
+        marks = self._where(env, TORCH)
         found = [mark.expand(len(states)) > 0.5 for mark in marks.values()]
         return torch.stack(found) if found else torch.ones(0, len(states), dtype=torch.bool)
 

@@ -11,11 +11,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
+from operator import mul
 from typing import TypeAlias
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import add, map_parts, multiply
-from stlc.compile.ir.support import columns_in
 from stlc.dynamics.model.step import ModelStep
 
 Lets: TypeAlias = Mapping[str, ir.Num]
@@ -49,7 +48,7 @@ def schedule(step: ModelStep) -> tuple[RolloutStage, ...]:
     A stage reads only its own states and expressions, and those of earlier stages.
     """
     numbers = step.numbers
-    reads = {name: columns_in(num) & (numbers.keys() | step.next.keys()) for name, num in numbers.items()}
+    reads = {name: num.columns & (numbers.keys() | step.next.keys()) for name, num in numbers.items()}
     reads |= {name: frozenset((f"{name}'",)) for name in step.next}
     level: dict[str, int] = {}
     groups: list[list[list[str]]] = []
@@ -126,7 +125,7 @@ def blocks(numbers: Lets) -> tuple[Lets, ...]:
     """Split named expressions into blocks, each of which reads only names of earlier blocks."""
     level: dict[str, int] = {}
     for name, num in numbers.items():
-        level[name] = 1 + max((level[other] for other in columns_in(num) if other in level), default=-1)
+        level[name] = 1 + max((level[other] for other in num.columns if other in level), default=-1)
     depth = max(level.values(), default=-1) + 1
     return tuple({name: numbers[name] for name in numbers if level[name] == at} for at in range(depth))
 
@@ -146,7 +145,7 @@ def _increment(states: Mapping[str, str], body: Lets) -> ir.Num | None:
     (state,) = states
     (num,) = body.values()
     match num:
-        case ir.Op("add", (ir.Signal(name), added)) if name == state and state not in columns_in(added):
+        case ir.Op("add", (ir.Signal(name), added)) if name == state and state not in added.columns:
             return added
         case _:
             return None
@@ -209,18 +208,18 @@ class Hoist:
 
     def split(self, num: ir.Num) -> ir.Num:
         """Replace the largest loop-invariant parts of `num` by names, and add these parts to `early`."""
-        if not columns_in(num) & self.moving:
+        if not num.columns & self.moving:
             return self._steady(num)
         match num:
             case ir.Op("add" | "sub" | "neg"):
                 return self._sum(num)
             case ir.Op("mul"):
                 return self._product(num)
-            case ir.Where(cond, yes, no) if not columns_in(cond) & self.moving:
+            case ir.Where(cond, yes, no) if not cond.columns & self.moving:
                 # It stays a choice: a product with 0 is NaN where the branch not taken is not finite.
-                return ir.Where(map_parts(cond, self._steady), self.split(yes), self.split(no))
+                return cond.map_parts(self._steady).select(self.split(yes), self.split(no))
             case _:
-                return map_parts(num, self.split)
+                return num.map_parts(self.split)
 
     def _steady(self, num: ir.Num) -> ir.Num:
         """Add a loop-invariant expression to `early`, and return the name that stands for it.
@@ -239,19 +238,19 @@ class Hoist:
     def _sum(self, num: ir.Num) -> ir.Num:
         """Rewrite a sum: its loop-invariant terms are combined into one expression in `early`."""
         terms = _terms(num)
-        moving = [(sign, self.split(term)) for sign, term in terms if columns_in(term) & self.moving]
-        steady = [(sign, term) for sign, term in terms if not columns_in(term) & self.moving]
+        moving = [(sign, self.split(term)) for sign, term in terms if term.columns & self.moving]
+        steady = [(sign, term) for sign, term in terms if not term.columns & self.moving]
         total = _signed_sum(moving)
         rest = _total(steady)
-        return total if rest == ir.Const(0.0) else add(total, self._steady(rest))
+        return total if rest == ir.Const(0.0) else total + self._steady(rest)
 
     def _product(self, num: ir.Num) -> ir.Num:
         """Rewrite a product: its loop-invariant factors are combined into one expression in `early`."""
         factors = _factors(num)
-        moving = [self.split(factor) for factor in factors if columns_in(factor) & self.moving]
-        steady = [factor for factor in factors if not columns_in(factor) & self.moving]
-        result = reduce(multiply, moving)
-        return multiply(result, self._steady(reduce(multiply, steady))) if steady else result
+        moving = [self.split(factor) for factor in factors if factor.columns & self.moving]
+        steady = [factor for factor in factors if not factor.columns & self.moving]
+        result = reduce(mul, moving)
+        return result * self._steady(reduce(mul, steady)) if steady else result
 
 
 def _terms(num: ir.Num, sign: int = 1) -> list[tuple[int, ir.Num]]:
@@ -279,9 +278,9 @@ def _factors(num: ir.Num) -> list[ir.Num]:
 def _signed_sum(terms: Sequence[tuple[int, ir.Num]]) -> ir.Num:
     """Return the sum of (sign, term) pairs, with the positive terms first."""
     (sign, total), *rest = sorted(terms, key=lambda pair: pair[0] < 0)
-    total = total if sign > 0 else ir.Op("neg", (total,))
+    total = total if sign > 0 else -total
     for sign, term in rest:
-        total = ir.Op("add" if sign > 0 else "sub", (total, term))
+        total = total.apply("add" if sign > 0 else "sub", term)
     return total
 
 
@@ -292,4 +291,4 @@ def _total(terms: list[tuple[int, ir.Num]]) -> ir.Num:
     if not variable:
         return ir.Const(constant)
     total = _signed_sum(variable)
-    return total if constant == 0.0 else add(total, ir.Const(constant))
+    return total if constant == 0.0 else total + constant

@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import Assignments, add, multiply, substitute
-from stlc.compile.ir.support import columns_in
+from stlc.dynamics.declaration.assignments import Assignments
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.motion import JumpDecl
 from stlc.dynamics.model.integrators._tableau import State
@@ -63,8 +62,8 @@ def _given(jump: JumpDecl, given: State) -> JumpDecl:
     """Return the jump with each control in it replaced by the actuator command in `given`."""
     if not given:
         return jump
-    resets = tuple(replace(each, value=substitute(each.value, given)) for each in jump.resets)
-    return replace(jump, guard=substitute(jump.guard, given), resets=resets)
+    resets = tuple(replace(each, value=each.value.substitute(given)) for each in jump.resets)
+    return replace(jump, guard=jump.guard.substitute(given), resets=resets)
 
 
 def _flow(decl: SystemDecl, writer: Assignments, state: State, given: State) -> State:
@@ -79,12 +78,12 @@ def _flow(decl: SystemDecl, writer: Assignments, state: State, given: State) -> 
 
     def rate(at: State) -> State:
         table = {**named(at), **given}
-        return {assign.name: substitute(assign.value, table) for assign in decl.flow}
+        return {assign.name: assign.value.substitute(table) for assign in decl.flow}
 
     def happened(at: State, due: Sequence[ir.Formula]) -> State:
         before = at
         for jump, cond in zip(located, due, strict=True):
-            resets = tuple(replace(each, value=substitute(each.value, before)) for each in jump.resets)
+            resets = tuple(replace(each, value=each.value.substitute(before)) for each in jump.resets)
             at = _jump(replace(jump, guard=cond, resets=resets), at, soft=False)
         return at
 
@@ -115,7 +114,7 @@ def _jump(jump: JumpDecl, state: State, *, soft: bool) -> State:
         if soft:
             changed[assign.name] = _blend(jump.guard, assign.value, flowed, jump.sharpness)
         else:
-            changed[assign.name] = ir.Where(jump.guard, assign.value, flowed)
+            changed[assign.name] = jump.guard.select(assign.value, flowed)
     return changed
 
 
@@ -126,11 +125,11 @@ def _updated(decl: SystemDecl, writer: Assignments, state: State) -> State:
     """
     if not decl.updates:
         return state
-    before = {f"{name}{ir.BEFORE}": ir.Signal(name) for name in decl.signature.names}
-    read = frozenset[str]().union(*(columns_in(assign.value) for assign in decl.updates))
+    before = {each.before.name: each for each in map(ir.Signal, decl.signature.names)}
+    read = frozenset[str]().union(*(assign.value.columns for assign in decl.updates))
     known = {name: writer.name(num, name + "#{}") if name in read else num for name, num in state.items()}
     for assign in decl.updates:
-        num = substitute(assign.value, {**known, **before})
+        num = assign.value.substitute({**known, **before})
         known[assign.name] = writer.name(num, assign.name + "#{}") if assign.name in read else num
     return known
 
@@ -141,9 +140,9 @@ def _blend(cond: ir.Formula, yes: ir.Num, no: ir.Num, sharpness: float | None) -
     I is the function I_w of Eq. 6, with values between 0 and 1. The result is exactly `yes` or `no` where I
     is 1 or 0.
     """
-    weight = ir.Indicator(cond, sharpness)
-    kept = multiply(ir.Op("sub", (ir.Const(1.0), weight)), no)
-    return kept if yes == ir.Const(0.0) else add(multiply(weight, yes), kept)
+    weight = cond.indicator(sharpness)
+    kept = (1.0 - weight) * no
+    return kept if yes == ir.Const(0.0) else weight * yes + kept
 
 
 def _clamped(decl: SystemDecl, name: str, num: ir.Num) -> ir.Num:
@@ -151,4 +150,4 @@ def _clamped(decl: SystemDecl, name: str, num: ir.Num) -> ir.Num:
     if name not in decl.clamps:
         return num
     low, high = decl.clamps[name]
-    return ir.Op("clip", (num, ir.Const(low), ir.Const(high)))
+    return num.apply("clip", low, high)

@@ -11,8 +11,6 @@ from torch import Tensor
 
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.ir import nodes as ir
-from stlc.compile.semantics.switch import Hard
 from stlc.dynamics.declaration.deployment import ErrorsDecl, EventDecl
 from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.declaration.perturbable import perturbable
@@ -221,7 +219,7 @@ class _Event:
     def __init__(self, decl: EventDecl) -> None:
         self.decl = decl
         self.draws = [Drawing(assign) for assign in decl.sets]
-        self.when = ArrayProgram({_CONDITION: ir.Indicator(decl.when)}) if decl.when is not None else None
+        self.when = ArrayProgram({_CONDITION: decl.when.indicator()}) if decl.when is not None else None
         self.held: Tensor | None = None
 
     def fires(self, columns: dict[str, Tensor], step: int) -> Tensor:
@@ -240,7 +238,7 @@ class _Event:
         now = torch.full_like(like, due, dtype=torch.bool)
         if self.when is None:
             return now
-        holds = torch.as_tensor(self.when(columns, TORCH, Hard())[_CONDITION] > 0.5).expand(len(like))
+        holds = torch.as_tensor(self.when(columns, TORCH)[_CONDITION] > 0.5).expand(len(like))
         before, self.held = self.held, holds
         match self.decl.edge:
             case "rise":

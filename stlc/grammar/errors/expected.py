@@ -13,7 +13,7 @@ from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar.errors.failure import ParseFailure
 from stlc.grammar.errors.units import unit_advice
 from stlc.grammar.scan import CLOSES, Lexeme, brackets, closes
-from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, OPERATORS, RESERVED, ROLES, UNARY_TEMPORAL
+from stlc.grammar.words import DECLARATIONS, OPERATORS, RESERVED, ROLES
 from stlc.similar import closest
 from stlc.source import Label, Span
 from stlc.units import Unit
@@ -44,8 +44,7 @@ _SIGNS: Mapping[str, str] = MappingProxyType(
 )
 _REPAIRS = ("COLON", "COMMA", "EQUAL", "RPAR", "RSQB", "RBRACE", "_DOTS", "_ARROW", "_IN", "_FN")
 _CLOSING = ("RPAR", "RSQB", "RBRACE")
-_TEMPORAL = UNARY_TEMPORAL | BINARY_TEMPORAL
-_LETTERS = frozenset(word for word in _TEMPORAL if len(word) == 1)
+_LETTERS = frozenset(word for word in OPERATORS if len(word) == 1)
 _POSTFIX = frozenset({"LPAR", "LSQB", "DOT"})
 _BEFORE_FORMULA = frozenset(
     {":", "and", "&", "&&", "or", "|", "||", "xor", "->", "=>", "implies", "not", "!"}
@@ -94,7 +93,7 @@ def misspelt_operator(failure: ParseFailure) -> Diagnostic | None:
 
 
 _OPERATORS = (
-    *OPERATORS,
+    *dict.fromkeys(each.name for each in OPERATORS.values()),
     *("and", "or", "xor", "not", "implies", "forall", "exists", "freeze", "then", "else"),
 )
 _NEAR_BY, _LEAST_LETTERS = 4, 3
@@ -140,8 +139,8 @@ def wrong_name(failure: ParseFailure) -> Diagnostic | None:
         found = failure.follower if same_line else None
     if found is None or found.text not in RESERVED:
         return None
-    meaning = _TEMPORAL.get(found.text)
-    means = f" (it means `{meaning}`)" if meaning not in (None, found.text) else ""
+    operator = OPERATORS.get(found.text)
+    means = "" if operator is None or operator.name == found.text else f" (it means `{operator.name}`)"
     span = failure.of(found)
     return Diagnostic(
         "E010",
@@ -288,9 +287,11 @@ def _operand(failure: ParseFailure) -> str:
     if "UNARY" not in failure.accepts:
         return "a value"
     previous = failure.previous
-    if previous is None or previous.text in _BEFORE_FORMULA or previous.text in UNARY_TEMPORAL:
+    operator = None if previous is None else OPERATORS.get(previous.text)
+    unary = operator is not None and not operator.binary
+    if previous is None or previous.text in _BEFORE_FORMULA or unary:
         return "a formula" if failure.piece.rule == "start" else "an expression"
-    if previous.text in BINARY_TEMPORAL or ("RPAR" not in failure.accepts and previous.text in ("]", ")")):
+    if operator is not None or ("RPAR" not in failure.accepts and previous.text in ("]", ")")):
         return "a formula"
     return "an expression"
 
@@ -336,7 +337,7 @@ def _notes(failure: ParseFailure) -> tuple[str, ...]:
     name = next((lexeme.text for lexeme in near if lexeme is not None and lexeme.text in _LETTERS), None)
     if name is None:
         return ()
-    return (f"`{name}` means `{_TEMPORAL[name]}`; a name of your own is written `` `{name}` ``",)
+    return (f"`{name}` means `{OPERATORS[name].name}`; a name of your own is written `` `{name}` ``",)
 
 
 def _shortened(text: str) -> str:

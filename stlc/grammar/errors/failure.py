@@ -8,9 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from stlc.grammar.scan import Bracket, Lexeme, brackets, lexemes
+from stlc.grammar.scan import Bracket, Lexeme, brackets
 from stlc.grammar.tables import acceptable, parses
-from stlc.grammar.words import BINARY_TEMPORAL
+from stlc.grammar.words import OPERATORS
 from stlc.source import Source, Span
 
 _REPAIRABLE = 100_000
@@ -59,7 +59,7 @@ class ParseFailure:
     @cached_property
     def lexemes(self) -> tuple[Lexeme, ...]:
         """All lexemes (words, numbers, strings and signs) of the part."""
-        return tuple(lexemes(self.piece.source.text, self.piece.start, self.piece.end))
+        return tuple(Lexeme.scan(self.piece.source.text, self.piece.start, self.piece.end))
 
     @cached_property
     def before(self) -> tuple[Lexeme, ...]:
@@ -89,7 +89,7 @@ class ParseFailure:
         """
         if self.piece.rule != "start":
             return None
-        return next(lexemes(self.piece.source.text, self.piece.end), None)
+        return next(Lexeme.scan(self.piece.source.text, self.piece.end), None)
 
     @cached_property
     def accepts(self) -> frozenset[str]:
@@ -139,7 +139,7 @@ class ParseFailure:
         number = source.position(edits[0][0])[0]
         start = source.line_starts[number - 1]
         line = source.line(number)
-        written = max((lexeme.end for lexeme in lexemes(line)), default=0)
+        written = max((lexeme.end for lexeme in Lexeme.scan(line)), default=0)
         line = line[: max(written, *(high - start for _, high, _ in edits))]
         for low, high, replacement in sorted(edits, reverse=True):
             line = line[: low - start] + replacement + line[high - start :]
@@ -170,5 +170,5 @@ _OPENERS = ("(", "[", "{")
 _CLOSERS = (")", "]", "}")
 _LOOSE = frozenset(
     {"and", "&", "&&", "or", "|", "||", "xor", "->", "=>", "implies", "<->", "<=>", "iff"}
-    | {":", "=", ",", ";", "then", "else", "if", *BINARY_TEMPORAL}
+    | {":", "=", ",", ";", "then", "else", "if", *(word for word, each in OPERATORS.items() if each.binary)}
 )

@@ -7,11 +7,9 @@ import re
 from stlc.diagnostics import Diagnostic
 from stlc.grammar.errors.failure import ParseFailure
 from stlc.grammar.scan import brackets
-from stlc.grammar.words import BINARY_TEMPORAL, UNARY_TEMPORAL
+from stlc.grammar.words import OPERATORS
 
-_OPERATOR = re.compile(
-    rf"\b({'|'.join(sorted({**UNARY_TEMPORAL, **BINARY_TEMPORAL}, key=len, reverse=True))})_?\s*(?=\[)"
-)
+_OPERATOR = re.compile(rf"\b({'|'.join(sorted(OPERATORS, key=len, reverse=True))})_?\s*(?=\[)")
 _BOUNDS = re.compile(r"\[\s*([\d.]+)\s*,\s*([\d.]+)\s*\]")
 _INDEXED = re.compile(r"\b(\w+)\[t\]")
 _SINGLE = re.compile(r"\(([^()&|]*)\)$")
@@ -51,8 +49,7 @@ def definition_of_breach(failure: ParseFailure) -> Diagnostic | None:
     if not source.text.startswith(":=", sign.start):
         return None
     line = source.text[sign.start + 2 :].partition("\n")[0].partition("#")[0].strip()
-    words = {**UNARY_TEMPORAL, **BINARY_TEMPORAL}
-    line = _OPERATOR.sub(lambda match: words[match[1]], line)
+    line = _OPERATOR.sub(lambda match: OPERATORS[match[1]].name, line)
     line = _BOUNDS.sub(r"[\1 s, \2 s]", _INDEXED.sub(r"\1", line))
     line = _SINGLE.sub(r"\1", line)
     return Diagnostic(

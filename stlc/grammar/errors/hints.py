@@ -22,7 +22,7 @@ from stlc.grammar.errors.failure import ParseFailure, Piece
 from stlc.grammar.errors.foreign import definition_of_breach, number_over_window
 from stlc.grammar.errors.unicode import apart, named, replacement, unexpected_character
 from stlc.grammar.scan import Bracket, Lexeme, brackets, opens_interval
-from stlc.grammar.words import BINARY_TEMPORAL
+from stlc.grammar.words import OPERATORS
 
 Recogniser = Callable[[ParseFailure], Diagnostic | None]
 
@@ -127,7 +127,7 @@ def _unclosed(failure: ParseFailure) -> Diagnostic | None:
 
 def _chain(failure: ParseFailure) -> Diagnostic | None:
     found = failure.found
-    if found is None or _operator(found) not in BINARY_TEMPORAL or "AND" not in failure.accepts:
+    if found is None or not _is_binary(found) or "AND" not in failure.accepts:
         return None
     second = len(failure.before)
     first = _until_before(failure, second)
@@ -153,6 +153,11 @@ def _operator(lexeme: Lexeme) -> str:
     return lexeme.text.rstrip("_") if lexeme.kind == "word" else lexeme.text
 
 
+def _is_binary(lexeme: Lexeme) -> bool:
+    operator = OPERATORS.get(_operator(lexeme))
+    return operator is not None and operator.binary
+
+
 def _until_before(failure: ParseFailure, index: int) -> int | None:
     depth = 0
     for i in range(index - 1, -1, -1):
@@ -160,7 +165,7 @@ def _until_before(failure: ParseFailure, index: int) -> int | None:
         depth += (text in (")", "]", "}")) - (text in ("(", "[", "{"))
         if depth < 0:
             return None
-        if depth == 0 and _operator(failure.lexemes[i]) in BINARY_TEMPORAL:
+        if depth == 0 and _is_binary(failure.lexemes[i]):
             return i
     return None
 

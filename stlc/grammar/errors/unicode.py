@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from stlc.diagnostics import Diagnostic, Fix
-from stlc.grammar.scan import Lexeme, lexemes
+from stlc.grammar.scan import Lexeme
 from stlc.source import Source
 
 
@@ -112,7 +112,7 @@ def _unseen(text: str, start: int, end: int) -> Iterator[tuple[int, str | None]]
         return
     signs: set[int] = set()
     quoted: set[int] = set()
-    for lexeme in lexemes(text, start, end):
+    for lexeme in Lexeme.scan(text, start, end):
         where = quoted if lexeme.kind in ("quoted", "string") else signs
         where.update(range(lexeme.start, lexeme.end))
     for at in places:
@@ -147,7 +147,7 @@ def plain_text(text: str) -> str:
     Symbols in comments, strings and quoted names are kept.
     """
     edits = [(at, blank) for at, blank in _unseen(text, 0, len(text)) if blank is not None]
-    for lexeme in lexemes(text):
+    for lexeme in Lexeme.scan(text):
         advice = replacement(lexeme.text[0]) if unexpected_character(lexeme) else None
         if advice is not None and advice.text is not None:
             edits.append((lexeme.start, apart(advice.text, text, lexeme.start)))

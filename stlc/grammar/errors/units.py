@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from stlc.grammar.words import UNIT_NAMES
+from types import MappingProxyType
+
 from stlc.similar import closest
 from stlc.units import Unit
 
@@ -10,6 +11,20 @@ _PREFIXES = "pnumkMG"
 _USUAL = tuple(
     prefix + unit for prefix in ("", *_PREFIXES) for unit in Unit.PREFIXED if prefix + unit in Unit.SYMBOLS
 )
+_NAMES = MappingProxyType(
+    {
+        **dict.fromkeys(("metre", "metres", "meter", "meters"), "m"),
+        **dict.fromkeys(("second", "seconds", "sec", "secs"), "s"),
+        **dict.fromkeys(("minute", "minutes", "mins"), "min"),
+        **dict.fromkeys(("hour", "hours", "hr", "hrs"), "h"),
+        **dict.fromkeys(("degree", "degrees"), "deg"),
+        **dict.fromkeys(("radian", "radians"), "rad"),
+        **dict.fromkeys(("kilogram", "kilograms", "kgs"), "kg"),
+        **dict.fromkeys(("kmh", "kph"), "km/h"),
+        **{"hertz": "Hz", "newton": "N", "volt": "V", "watt": "W", "percent": "%", "sample": "steps"},
+    }
+)
+"""Unit written out -> its symbol in the language."""
 _UNPREFIXED = ("min", "h", "ft", "mph", "lb", "rpm", "deg", "degC", "kg")
 
 
@@ -23,7 +38,7 @@ def unit_advice(word: str) -> tuple[str, ...]:
         return ("`T` is the planning horizon; a tesla is `Wb/m^2`, a millitesla `mT`",)
     if len(word) < 2 or word in Unit.SYMBOLS or Unit.celsius_advice(word):
         return ()
-    named = UNIT_NAMES.get(word.lower())
+    named = _NAMES.get(word.lower())
     alike = [named] if named else [unit for unit in _USUAL if unit.casefold() == word.casefold()]
     for prefix in "" if alike else _PREFIXES:
         rest = word.removeprefix(prefix)

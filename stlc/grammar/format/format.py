@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from stlc.diagnostics import SpecError
-from stlc.grammar import ast
 from stlc.grammar.ambiguity import Ambiguity, ambiguities
 from stlc.grammar.errors.unicode import plain_text
 from stlc.grammar.format.layout import (
@@ -33,7 +32,7 @@ from stlc.grammar.format.layout import (
     render,
 )
 from stlc.grammar.format.tokens import Text, behind, gap, prepare
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.grammar.tokens import Comment, Item, Token, TokenLayout, tokenize
 from stlc.source import Source
 
@@ -374,13 +373,13 @@ def format_text(source: Source) -> str:
     """
     source, spec = _read(source)
     formatted = lay_out(tokenize(source), tuple(ambiguities(spec)), width=WIDTH)
-    again = parse(Source(source.name, formatted))
+    again = Spec.parse(Source(source.name, formatted))
     if again != spec:
         raise AssertionError(f"the layout of {source.name} would change its meaning")
     return formatted
 
 
-def _read(source: Source) -> tuple[Source, ast.Spec]:
+def _read(source: Source) -> tuple[Source, Spec]:
     """Parse a source; return the source that was parsed, and its syntax tree.
 
     If the given source does not parse, symbols such as `≤` are replaced, and the result is parsed instead.
@@ -389,12 +388,12 @@ def _read(source: Source) -> tuple[Source, ast.Spec]:
         SpecError: neither text parses; the errors are those of the given text.
     """
     try:
-        return source, parse(source)
+        return source, Spec.parse(source)
     except SpecError as error:
         plain = Source(source.name, plain_text(source.text))
         if plain.text == source.text:
             raise
         try:
-            return plain, parse(plain)
+            return plain, Spec.parse(plain)
         except SpecError:
             raise error from None

@@ -13,13 +13,12 @@ from typing import Literal, TypeAlias
 from stlc.diagnostics import SpecError
 from stlc.grammar.fold import MAX_DEPTH
 from stlc.grammar.tokens import Token
-from stlc.grammar.words import BINARY_TEMPORAL, SPACE, UNARY_TEMPORAL
+from stlc.grammar.words import OPERATORS, SPACE
 
 Role: TypeAlias = Literal["interval", "call", "index", "group", "list", "enum"]
 
 _WORD = re.compile(r"[A-Za-z]+")
 _SPELLED = {"IFF": "<->", "IMPLIES": "->", "AND": "and", "_NOT": "not", "_NOT_IN": "not in"}
-_TEMPORAL = {**UNARY_TEMPORAL, **BINARY_TEMPORAL}
 _OPENING = frozenset("([{")
 _CLOSING = frozenset(")]}")
 _OPERAND = frozenset({"NAME", "NUMBER", "UNIT", "STRING", "TYPE_SIZE", "_TRUE", "_FALSE", "_INF"})
@@ -78,7 +77,7 @@ def spelling(kind: str, text: str) -> str:
     if kind.startswith(("UNARY", "BINARY")):
         match = _WORD.match(text)
         assert match is not None
-        return _TEMPORAL[match[0]] + ("@" if kind.endswith("_AT") else "")
+        return OPERATORS[match[0]].name + ("@" if kind.endswith("_AT") else "")
     if kind == "OR":
         return "xor" if text == "xor" else "or"
     if kind in ("UNIT_BRACKET", "TYPE_SIZE"):

@@ -18,7 +18,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from typing import Any, TypeAlias, assert_never
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,20 +29,6 @@ from stlc.compile.ir import typed
 from stlc.compile.ir.defined import defined_at
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.holes import KNOWN
-from stlc.compile.ir.lower import lower
-from stlc.compile.ir.normal_form import connective, unless
-from stlc.compile.ir.support import columns_in, history
-from stlc.compile.ir.traverse import (
-    from_now,
-    frozen_in,
-    is_state,
-    leaves,
-    nodes,
-    numbers,
-    on_clock,
-    operands,
-    substitute_frozen,
-)
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.cells import over_columns
 from stlc.monitor.values import Record, assume_missing_true, bounds
@@ -122,7 +108,7 @@ class CauseNode:
     def thawed(self) -> typed.Formula:
         """The sub-formula of a predicate with its frozen values in place."""
         values = {key: kept.num for key, kept in zip(_frozen_in(self), self.frozen, strict=True)}
-        return substitute_frozen(self.formula, values)
+        return self.formula.substitute_frozen(values)
 
     @property
     def leaf(self) -> CauseNode:
@@ -137,9 +123,8 @@ class CauseNode:
     @property
     def violated(self) -> int:
         """Instant at which the body of the outermost `always` is violated; without one, `sample`."""
-        outer: bool = isinstance(self.formula, (typed.Not, typed.Logic)) or (
-            isinstance(self.formula, typed.Temporal)
-            and self.formula.op == ("eventually" if self.holds else "always")
+        outer = self.formula.word == ("eventually" if self.holds else "always") or isinstance(
+            self.formula, (typed.Not, typed.Logic)
         )
         return self.parts[0].violated if outer and len(self.parts) == 1 else self.sample
 
@@ -212,9 +197,9 @@ class _Tied:
 
 def _leaves_of(formula: ir.Formula) -> dict[ir.Formula, None]:
     """Predicates of a formula, each once, as the keys of a dictionary; a `freeze` counts as one."""
-    if isinstance(formula, (ir.Predicate, ir.Freeze)):
+    if formula.own_numbers:
         return {formula: None}
-    return {leaf: None for part in operands(formula) for leaf in _leaves_of(part)}
+    return {leaf: None for part in formula.operands for leaf in _leaves_of(part)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,8 +264,8 @@ class CauseFinder:
         leaf, record = tree.leaf, self.record
         names = {name for name, _ in leaf.reads}
         own = self._lowered(leaf.thawed, not leaf.holds)
-        others = {node for node in nodes(lowered) if isinstance(node, ir.Predicate)} - set(_leaves_of(own))
-        shared = len(names) < len(leaf.reads) or any(columns_in(other.num) & names for other in others)
+        others = set(lowered.predicates()) - set(_leaves_of(own))
+        shared = len(names) < len(leaf.reads) or any(other.num.columns & names for other in others)
         if not tree.path_moves or not shared:
             return tree.path_moves
 
@@ -320,18 +305,16 @@ class CauseFinder:
                 return self._predicate(node)
             case _ if _is_written_predicate(formula):
                 return self._predicate(node)
-            case typed.Truth() | typed.Recalled():
-                return node
             case typed.Not(_, body):
                 found = replace(node, parts=(self.blame(body, sample, not wanted),))
             case typed.Logic():
                 found = self._logic(node, formula)
-            case typed.Temporal() | typed.Until() if on_clock(formula):
-                found = replace(self.blame(from_now(formula), 0, wanted), formula=formula)
+            case _ if formula.on_clock:
+                found = replace(self.blame(formula.from_now(), 0, wanted), formula=formula)
             case typed.Temporal():
                 found = self._temporal(node, formula)
             case typed.Until(_, "unless"):
-                found = replace(node, parts=(self.blame(unless(formula), sample, wanted),))
+                found = replace(node, parts=(self.blame(formula.unless(), sample, wanted),))
             case typed.Until():
                 found = self._until(node, formula)
             case typed.Shift(_, steps, body):
@@ -344,7 +327,7 @@ class CauseFinder:
             case typed.Freeze():
                 found = self._freeze(node, formula)
             case _:
-                assert_never(formula)
+                return node
         return _merged(found)
 
     def violations(
@@ -361,7 +344,7 @@ class CauseFinder:
             case typed.Not(_, body):
                 yield from self.violations(body, instants, wanted=not wanted)
             case typed.Temporal(_, op, _, body) if op == ("always" if wanted else "eventually"):
-                here = from_now(formula) if on_clock(formula) else formula
+                here = formula.from_now() if formula.on_clock else formula
                 windows = [self._instants(self._lowered(here, wanted), int(k)) for k in instants]
                 edges = np.zeros(max((each.stop for each in windows), default=0) + 1, np.int64)
                 for window in windows:
@@ -371,7 +354,7 @@ class CauseFinder:
                 inside = np.flatnonzero(np.cumsum(edges) > 0)
                 yield from self._failing(body, inside, wanted)
             case typed.Logic():
-                outer = connective(formula, 1 if wanted else -1)
+                outer = formula.connective(1 if wanted else -1)
                 if outer.op == "or" or any(len(group) > 1 for group in outer.groups):
                     yield Violations(formula, wanted, instants)
                     return
@@ -397,9 +380,8 @@ class CauseFinder:
         key = (formula, wanted)
         if key not in self.cache:
             goal = formula if wanted else typed.Not(formula.span, formula)
-            thawed = substitute_frozen(
-                lower(goal, self.grid, []), {key: kept.num for key, kept in self.frozen.items()}
-            )
+            bound = {key: kept.num for key, kept in self.frozen.items()}
+            thawed = self.grid.lower(goal, []).substitute_frozen(bound)
             given = assume_missing_true(thawed, self.record.env)
             self.cache[key] = self.record.sides(given)[1]
         return self.cache[key]
@@ -438,19 +420,17 @@ class CauseFinder:
         return CauseNode(formula, not wanted, sample, margin if wanted else -margin)
 
     def _predicate(self, node: CauseNode) -> CauseNode:
-        reads = self._reads(numbers(self._lowered(node.formula, not node.holds)), node.sample)
+        reads = self._reads(self._lowered(node.formula, not node.holds).numbers(), node.sample)
         frozen = tuple(self.frozen[key] for key in _frozen_in(node))
         return replace(node, reads=tuple(sorted(reads)), frozen=frozen)
 
     def _reads(self, nums: Iterable[ir.Num], sample: int) -> set[tuple[str, int]]:
         """Pairs (signal, offset) of the values that expressions read when evaluated at `sample`."""
         found = set()
-        for leaf in (leaf for num in nums for leaf in leaves(num)):
-            if isinstance(leaf, ir.Signal) and not leaf.name.startswith(KNOWN):
-                found.add((leaf.name, 0))
-            elif isinstance(leaf, ir.ShiftedSignal) and not leaf.name.startswith(KNOWN):
-                there = min(max(sample + leaf.steps, 0), self.record.samples - 1)
-                found.add((leaf.name, there - sample if leaf.clamped else leaf.steps))
+        for name, later, clamped in (read for num in nums for read in num.reads()):
+            if not name.startswith(KNOWN):
+                there = min(max(sample + later, 0), self.record.samples - 1)
+                found.add((name, there - sample if clamped else later))
         return found
 
     def _freeze(self, node: CauseNode, formula: typed.Freeze) -> CauseNode:
@@ -468,9 +448,9 @@ class CauseFinder:
         outer = {key: kept.num for key, kept in self.frozen.items()}
         units = formula.units or (Unit.ONE,) * len(formula.bindings)
         for (key, written), unit in zip(formula.bindings, units, strict=True):
-            num = substitute_frozen(written, outer)
+            num = written.substitute_frozen(outer)
             value: ir.Num = ir.ShiftedSignal(next(iter(self.record.env)), last + 1)
-            given = columns_in(num) <= self.record.env.keys()
+            given = num.columns <= self.record.env.keys()
             here = range(sample, sample + 1)
             if given and sample <= last and defined_at(ir.Predicate(num), last + 1, here):
                 low, high = bounds(ir.Predicate(num), self.record, here, "open")
@@ -482,7 +462,7 @@ class CauseFinder:
     # ---------------------------------------------------------------- connectives
 
     def _logic(self, node: CauseNode, formula: typed.Logic) -> CauseNode:
-        outer = connective(formula, -1 if node.holds else 1)
+        outer = formula.connective(-1 if node.holds else 1)
         groups = [[(part, node.sample, sign > 0) for part, sign in group] for group in outer.groups]
         if outer.op == "and":  # of the group that is farthest from holding, no operand has the needed value
             items = min(groups, key=lambda group: max(self._margin(*item) for item in group))
@@ -526,10 +506,11 @@ class CauseFinder:
 
     def _instants(self, lowered: ir.Formula, sample: int) -> range:
         """Instants in the window of `lowered` at `sample`, except where operands cannot be known."""
-        if not isinstance(lowered, ir.Windowed):
+        operator, known = lowered.windowed, self._stop(lowered)
+        if operator is None:
             raise TypeError(f"{type(lowered).__name__} has no window")
-        window, known = lowered.window, self._stop(lowered)
-        if lowered.back:
+        window = operator.window
+        if operator.back:
             return range(0 if window.hi is None else max(sample - window.hi, 0), sample - window.lo + 1)
         if window.hi is not None:
             known = min(sample + window.hi + 1, known)
@@ -539,7 +520,7 @@ class CauseFinder:
 
     def _stop(self, lowered: ir.Formula) -> int:
         """First instant at which operands are unknown; past operators read samples before it, too."""
-        return self.record.samples + min(max(map(history, operands(lowered))), _MOST_LATER)
+        return self.record.samples + min(max(each.history for each in lowered.operands), _MOST_LATER)
 
     def _temporal(self, node: CauseNode, formula: typed.Temporal) -> CauseNode:
         wanted = not node.holds
@@ -557,7 +538,7 @@ class CauseFinder:
         sample, wanted = node.sample, not node.holds
         lowered = self._lowered(formula, wanted)
         instants = self._instants(lowered, sample)
-        last = lowered.window.hi if isinstance(lowered, ir.Until) else None
+        last = None if formula.op == "since" or lowered.windowed is None else lowered.windowed.window.hi
         # the window extends to instants at which operands are unknown
         beyond = last is not None and (not instants or instants[-1] < sample + last)
         if not instants and not beyond:
@@ -589,7 +570,7 @@ def _throughout(node: CauseNode, instants: range) -> CauseNode:
     """The node, and what it negates, with all instants of a window, at which the truth value is the same."""
     if len(instants) < 2:
         return node
-    negated = isinstance(node.formula, typed.Not) and len(node.parts) == 1
+    negated = node.formula.word == "not" and len(node.parts) == 1
     parts = (_throughout(node.parts[0], instants),) if negated else node.parts
     return replace(node, during=instants, parts=parts)
 
@@ -597,7 +578,7 @@ def _throughout(node: CauseNode, instants: range) -> CauseNode:
 def _is_written_predicate(formula: typed.Formula) -> bool:
     """True for a formula that is one predicate in the source, such as `a != b` or `x not in [1, 2]`."""
     whole = formula.span
-    return bool(whole.text) and is_state(formula) and all(node.span == whole for node in nodes(formula))
+    return bool(whole.text) and formula.is_state() and all(node.span == whole for node in formula.walk())
 
 
 def _merged(node: CauseNode) -> CauseNode:
@@ -617,7 +598,7 @@ def _merged(node: CauseNode) -> CauseNode:
 
 def _frozen_in(node: CauseNode) -> list[str]:
     """Keys of the frozen values that a predicate reads, in the order of their names."""
-    return sorted(frozenset().union(*map(frozen_in, numbers(node.formula))))
+    return sorted(frozenset().union(*(each.frozen for each in node.formula.numbers())))
 
 
 def _greatest_known(margins: Floats) -> int:

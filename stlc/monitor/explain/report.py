@@ -9,10 +9,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from stlc.compile.augment.lift import from_first_sample
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.traverse import margin_unit
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.grammar import ast
 from stlc.jsontext import Num
@@ -185,7 +183,7 @@ def violations(verdict: Verdict, name: str, trace: int, most: int) -> list[Viola
     Left out are those that no single sample in each step shows. Raises UsageError (U101) for an unknown
     requirement.
     """
-    judgement, definitions = verdict[name], _definitions(verdict.subject.compiled.spec)
+    judgement, definitions = verdict[name], verdict.subject.compiled.spec.definitions
     judged = _JudgedTrace.of(judgement, verdict.subject, trace)
     found: dict[int, tuple[int, CauseFinder, typed.Formula, bool]] = {}
     finder = None
@@ -213,7 +211,7 @@ def cause_of(judgement: RequirementVerdict) -> Cause | None:
     """Return the cause of the worst violation of a violated requirement; None if no sample shows it."""
     subject, (trace, start) = judgement.subject, judgement.worst
     assert subject is not None
-    definitions = _definitions(subject.compiled.spec)
+    definitions = subject.compiled.spec.definitions
     judged = _JudgedTrace.of(judgement, subject, trace)
     start -= judged.first
     if not judged.shows(start):
@@ -240,7 +238,7 @@ class _JudgedTrace:
     @property
     def formula(self) -> typed.Formula:
         rule = self.judgement.rule
-        return from_first_sample(rule.typed.formula) if rule.absolute else rule.typed.formula
+        return rule.typed.formula.from_first_sample() if rule.absolute else rule.typed.formula
 
     @property
     def window(self) -> int | None:
@@ -284,7 +282,7 @@ class _JudgedTrace:
             alone=alone,
             timeline=self.subject.timeline,
             first=self.first,
-            unit=margin_unit(leaf.formula),
+            unit=leaf.formula.margin_unit,
             subject=self.subject,
         )
 
@@ -448,10 +446,6 @@ def names_in(expr: object) -> Iterator[ast.Name]:
     elif isinstance(expr, ast.Node):
         for part in fields(expr):
             yield from names_in(getattr(expr, part.name))
-
-
-def _definitions(spec: ast.Spec) -> dict[str, ast.Expr]:
-    return {item.name: item.value for item in spec.items if isinstance(item, (ast.Def, ast.Region))}
 
 
 def _flat(text: str) -> str:

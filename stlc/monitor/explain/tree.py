@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
-from stlc.compile.ir.traverse import margin_unit
 from stlc.jsontext import Num
 from stlc.monitor.explain.causes import CauseNode
 from stlc.monitor.explain.report import Cause, readings_of
@@ -127,7 +126,7 @@ def _step(depth: int, node: CauseNode, cause: Cause) -> Step:
         node.holds,
         timeline.time(node.sample),
         node.rho,
-        margin_unit(node.formula),
+        node.formula.margin_unit,
         readings,
         when,
     )

@@ -11,13 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import Bounds
 from stlc.compile.ir.holes import holes_in, without_holes
 from stlc.compile.ir.ranges import bounds
-from stlc.compile.ir.support import columns_in
-from stlc.grammar import ast
 from stlc.monitor.facts.triggers import Trigger, triggers
 from stlc.monitor.judgement import RequirementVerdict, Verdict
 from stlc.monitor.prepared import Prepared
@@ -62,7 +59,7 @@ class Evidence:
     def read(self) -> tuple[Column, ...]:
         """Signals that the judged requirements read, without parameters, which are constant by nature."""
         compiled, rules = self.subject.compiled, self.subject.rules
-        names = frozenset[str]().union(*(columns_in(rule.formula) for rule in rules)) & self.values.keys()
+        names = frozenset[str]().union(*(rule.formula.columns for rule in rules)) & self.values.keys()
         names -= {each.column.name for each in compiled.typed.parameters}
         return tuple(column for column in compiled.signature.columns if column.name in names)
 
@@ -91,12 +88,12 @@ class Evidence:
 
     def margins(self, predicate: ir.Predicate) -> Bounds:
         """Least and greatest margin of a predicate over all recorded values."""
-        if _linear(predicate.num):
+        if predicate.num.is_linear:
             return bounds(predicate.num, self.ranges) or (math.nan, math.nan)
-        env = {name: self.values[name] for name in columns_in(predicate.num)}
+        env = {name: self.values[name] for name in predicate.num.columns}
         holes, samples = holes_in(env), len(next(iter(env.values())))
         filled = without_holes(env, holes) if holes else env
-        (found,) = evaluate([predicate], filled, ops=NUMPY, count=samples, end="truncate")
+        (found,) = evaluate([predicate], filled, count=samples, end="truncate")
         for name in holes:
             found = np.where(np.isnan(env[name]), np.nan, found)
         return float(np.fmin.reduce(found, axis=None)), float(np.fmax.reduce(found, axis=None))
@@ -105,21 +102,5 @@ class Evidence:
         """Place of the declaration of a signal; the start of the text if there is none."""
         spec = self.subject.compiled.spec
         base = signal.partition("[")[0]
-        items = (i for i in spec.items if isinstance(i, (ast.Signal, ast.Param)))
-        places = (item.name_span for item in items if item.name == base)
+        places = (item.name_span for item in spec.read if item.name == base)
         return next(places, spec.source.span(0, 0))
-
-
-def _linear(num: ir.Num) -> bool:
-    """True for a linear function of one signal, whose range is that of the signal, mapped."""
-    match num:
-        case ir.Signal():
-            return True
-        case ir.Op("neg", (inner,)):
-            return _linear(inner)
-        case ir.Op("add" | "sub" | "mul" | "div", (inner, ir.Const())):
-            return _linear(inner)
-        case ir.Op("add" | "sub" | "mul", (ir.Const(), inner)):
-            return _linear(inner)
-        case _:
-            return False

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TypeAlias, final
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import Analysis, farthest, fold
+from stlc.compile.ir.support import Analysis, Offsets
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +24,7 @@ class Stretch:
     last: int | None
     absolute: bool = False
 
-    def over(self, offsets: ir.Offsets) -> Stretch:
+    def over(self, offsets: Offsets) -> Stretch:
         """Return what is read if the formula is evaluated at `offsets` from now."""
         if self.absolute:
             return self
@@ -45,7 +45,7 @@ _Reads: TypeAlias = frozenset[Stretch]
 
 def reads(formula: ir.Formula) -> _Reads:
     """Return the ranges of samples at which the predicates of a formula can be read."""
-    return fold(formula, _READS)
+    return formula.fold(_READS)
 
 
 def samples_read(formula: ir.Formula, starts: range, samples: int) -> tuple[range, ...]:
@@ -69,13 +69,13 @@ def samples_read(formula: ir.Formula, starts: range, samples: int) -> tuple[rang
 @final
 class _Reading(Analysis[_Reads]):
     def predicate(self, num: ir.Num) -> _Reads:
-        around = farthest(num)
+        around = num.farthest
         return frozenset({Stretch(-around.past, around.future)})
 
     def constant(self) -> _Reads:
         return frozenset()
 
-    def over(self, parts: Sequence[_Reads], offsets: Sequence[ir.Offsets]) -> _Reads:
+    def over(self, parts: Sequence[_Reads], offsets: Sequence[Offsets]) -> _Reads:
         pairs = zip(parts, offsets, strict=True)
         return frozenset(each.over(where) for part, where in pairs for each in part)
 

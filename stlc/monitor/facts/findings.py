@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from stlc.diagnostics import Diagnostic, StlcError
-from stlc.grammar import ast
+from stlc.grammar.spec import Spec
 from stlc.monitor.verdict import Monitor
 
 
-def findings_on(spec: ast.Spec, trace: Path, system: str | None = None) -> tuple[Diagnostic, ...]:
+def findings_on(spec: Spec, trace: Path, system: str | None = None) -> tuple[Diagnostic, ...]:
     """Return what `stlc check` would say of a recording beside its verdicts, with places in the text.
 
     Args:

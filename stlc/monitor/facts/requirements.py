@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import columns_in
-from stlc.compile.ir.traverse import leaves, nodes
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import Diagnostic
 from stlc.monitor.facts.evidence import Evidence
@@ -86,9 +84,8 @@ def out_of_reach(evidence: Evidence) -> Iterator[Fact]:
     for judged in evidence.satisfied:
         atoms = {
             " ".join(node.span.text.split()): node
-            for node in nodes(judged.rule.formula)
-            if isinstance(node, ir.Predicate) and node.span is not None and columns_in(node.num)
-            if not any(isinstance(leaf, ir.FrozenVar) for leaf in leaves(node.num))
+            for node in judged.rule.formula.predicates()
+            if node.span is not None and node.columns and not node.frozen
         }
         for written, atom in atoms.items():
             least, most = evidence.margins(atom)

@@ -12,13 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.augment.lift import from_first_sample
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.discretize import to_window
-from stlc.compile.ir.lower import lower
 from stlc.compile.ir.simplify import simplify
-from stlc.compile.ir.traverse import absolute, leaves, numbers
 from stlc.monitor.judgement import RequirementVerdict
 from stlc.monitor.prepared import Part, Prepared
 from stlc.monitor.uncertain import outer
@@ -65,38 +61,44 @@ class _Walk:
         """Yield the obligations of a formula that has to hold at the instants `at`."""
         if not at.any():
             return
-        match node:
-            case typed.Logic(_, "->", (left, right)) if (held := self.held(left)) is not None:
+        if (operator := node.temporal) is not None:
+            yield from self.visit_temporal(operator, at)
+        elif node.word == "->":
+            left, right = node.operands
+            if (held := self.held(left)) is not None:
                 yield Trigger(left.span, at, at & held)
                 yield from self.visit(right, at & held)
-            case typed.Logic(_, "and", items):
-                for item in items:
-                    yield from self.visit(item, at)
-            case typed.Temporal(_, "always" | "historically", _, body):
-                yield from self.visit(body, self.window(node, at))
-            case typed.Temporal(_, "eventually", _, body) if (held := self.held(body)) is not None:
+        elif node.word in ("and", "freeze"):
+            for item in node.operands:
+                yield from self.visit(item, at)
+
+    def visit_temporal(self, node: typed.Timed, at: Bools) -> Iterator[Trigger]:
+        """Yield the obligations of a temporal operator that has to hold at the instants `at`."""
+        first, last = node.operands[0], node.operands[-1]
+        match node.op:
+            case "always" | "historically":
+                yield from self.visit(last, self.window(node, at))
+            case "eventually" if (held := self.held(last)) is not None:
                 lo = self.steps(node).lo
-                if node.interval.clock == "now" and lo < len(held):
+                if not node.on_clock and lo < len(held):
                     there = np.zeros_like(held)
                     there[: len(held) - lo] = held[lo:]
                     yield Trigger(node.span, at, at & ~there, "at once")
-            case typed.Until(_, "until" | "unless" | "release", interval, left, right):
-                ends = self.held(left if node.op == "release" else right)
-                if interval.clock == "now" and not self.steps(node).lo and ends is not None:
+            case "until" | "unless" | "release":
+                ends = self.held(first if node.op == "release" else last)
+                if not node.on_clock and not self.steps(node).lo and ends is not None:
                     yield Trigger(node.span, at, at & ~ends)
-            case typed.Freeze(_, _, body):
-                yield from self.visit(body, at)
             case _:
                 return
 
-    def steps(self, node: typed.Temporal | typed.Until) -> ir.Window:
+    def steps(self, node: typed.Timed) -> ir.Window:
         """Return the interval of an operator in samples."""
-        return to_window(node.interval, self.subject.compiled.grid, [], outward=node.op in _OUTWARD)
+        return self.subject.compiled.grid.window(node.interval, [], outward=node.op in _OUTWARD)
 
-    def window(self, node: typed.Temporal, at: Bools) -> Bools:
+    def window(self, node: typed.Timed, at: Bools) -> Bools:
         """Return the instants in the windows of `always` or `historically` that begin at `at`."""
         steps, samples = self.steps(node), len(at)
-        if node.interval.clock == "start":
+        if node.on_clock:
             first = np.zeros_like(at[:1])
             first[0] = at.any(axis=0)
             at = np.concatenate([first, np.zeros_like(at[1:])])
@@ -120,10 +122,10 @@ class _Walk:
 
     def held(self, node: typed.Formula) -> Bools | None:
         """Instants at which a formula may hold, (samples, traces); None if it reads a frozen value."""
-        if any(isinstance(leaf, ir.FrozenVar) for num in numbers(node) for leaf in leaves(num)):
+        if node.frozen:
             return None
-        written = from_first_sample(node) if absolute(node) else node
-        formula = by_truth(simplify(lower(written, self.subject.compiled.grid, [])))
+        written = node.from_first_sample() if node.absolute else node
+        formula = by_truth(simplify(self.subject.compiled.grid.lower(written, [])))
         record = self.subject.record.of_cells(formula, loose=False)
         _, high = outer(*bounds(formula, record, range(record.samples), "truncate"))
         return np.asarray(high > 0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, final
 
@@ -14,8 +14,6 @@ from stlc import native
 from stlc.compile.backends.c.streams import TABLES, Rule, Streams, runtime, streams_of
 from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import endless, reach, uses_end
-from stlc.compile.ir.traverse import map_children
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.monitor.instants import beyond, window_of
 from stlc.monitor.online.history import Floats
@@ -206,7 +204,7 @@ class Streamed:
 def streamed_rule(asked: Asked, signals: Sequence[str]) -> Rule | None:
     """Return the requirement of a kernel; None if it has no transducers."""
     values, deciding = (_in_windows(each, asked) for each in (asked.rule, asked.deciding))
-    if values is None or deciding is None or (asked.everywhere and endless(values)):
+    if values is None or deciding is None or (asked.everywhere and values.endless):
         return None
     rule = Rule(values, deciding, asked.lag)
     try:
@@ -226,13 +224,11 @@ def _in_windows(rule: CompiledRequirement, asked: Asked) -> ir.Formula | None:
     window = window_of(rule, asked.horizon)
 
     def moved(part: ir.Formula) -> ir.Formula:
-        if isinstance(part, ir.BoolOp):
-            return map_children(part, formulas=moved)
         if window is None:
-            return part.body if isinstance(part, ir.AtStart) and not asked.begin else part
-        if isinstance(part, (ir.Temporal, ir.Until)) and part.window.hi is None and part.window.lo <= window:
-            return replace(part, window=ir.Window(part.window.lo, window))
+            return part if asked.begin else part.from_first
+        if (operator := part.unbounded) and operator.window.lo <= window:
+            return operator.with_window(operator.window.lo, window)
         return part
 
-    found = moved(rule.formula)
-    return None if window is not None and (uses_end(found) or reach(found).future > window) else found
+    found = rule.formula.map_terms(moved)
+    return None if window is not None and (found.uses_end or found.reach.future > window) else found

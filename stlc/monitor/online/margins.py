@@ -9,7 +9,6 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.ir.support import columns_in
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.tolerance import TOLERANCE, StatusInScope
 from stlc.monitor.online.history import ColumnHistory, Floats
@@ -107,7 +106,7 @@ class Margins:
             )
             for rule in rules
         }
-        self._names = sorted({name for rule in rules for name in columns_in(rule.formula)})
+        self._names = sorted({name for rule in rules for name in rule.formula.columns})
         self._history = ColumnHistory()
         self._found: dict[str, Margin] = {}
         self._evaluated = 0

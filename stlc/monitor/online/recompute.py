@@ -14,18 +14,15 @@ from typing import TypeAlias, final
 
 import numpy as np
 
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.schedule import PICKS, neutral
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import endless, farthest, history, reach
-from stlc.compile.ir.traverse import numbers, operands
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.tolerance import Status
 from stlc.diagnostics import usage
 from stlc.monitor.instants import cut_bounds, growing_bounds, rule_bounds, window_of
 from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.tally import Asked, Flags, JudgedInstants, RequirementSummary
-from stlc.monitor.prefix_bounds import own_span, prefix_bound, with_seen
+from stlc.monitor.prefix_bounds import prefix_bound, with_seen
 from stlc.monitor.values import Ends, Record
 
 MOST = 1 << 26
@@ -65,22 +62,22 @@ class GrowingBounds:
 
     @property
     def _lasting(self) -> bool:
-        return self._window is None and endless(self.rule.formula)
+        return self._window is None and self.rule.formula.endless
 
     def settled(self, samples: int) -> int:
         """The first instant at which a sample after `samples` of them may change the value."""
         ahead = self.rule.reach if self._window is None else self._window
-        later = max((farthest(num).future for num in numbers(self.rule.formula)), default=0)
+        later = max((num.farthest.future for num in self.rule.formula.numbers()), default=0)
         return 0 if self._lasting else max(samples - ahead - later, 0)
 
     def needs(self, start: int) -> int:
         """The first sample that instants from `start` on read."""
-        return 0 if self.rule.absolute or self._lasting else max(start - history(self.rule.formula), 0)
+        return 0 if self.rule.absolute or self._lasting else max(start - self.rule.formula.history, 0)
 
     def live(self, signals: Columns, starts: range) -> tuple[Floats, Floats]:
         """Least and greatest robustness over all continuations, (instants, traces) each."""
         window, cut, formula, parts = self._window, self.ending == "truncate", self.rule.formula, []
-        record = Record.of(with_seen(signals), NUMPY)
+        record = Record.of(with_seen(signals))
         middle = min(max(self.settled(record.samples), starts.start), starts.stop) if cut else starts.start
         if known := range(starts.start, middle):
             parts.append(cut_bounds(self.rule, record, known, self.horizon, "truncate"))
@@ -94,7 +91,7 @@ class GrowingBounds:
 
     def ended(self, signals: Columns, starts: range) -> tuple[Floats, Floats]:
         """Bounds if the trace ends with the last sample, (instants, traces) each."""
-        low, high = rule_bounds(self.rule, Record.of(signals, NUMPY), starts, self.horizon, self.ending)
+        low, high = rule_bounds(self.rule, Record.of(signals), starts, self.horizon, self.ending)
         return np.asarray(low), np.asarray(high)
 
 
@@ -120,14 +117,16 @@ class Extremum:
     @staticmethod
     def of(asked: Asked) -> Extremum | None:
         """Return the extremum of a requirement; None unless it is such an operator over bounded windows."""
-        node, rule = asked.rule.formula, asked.rule
+        node, rule = asked.rule.formula.unbounded, asked.rule
         moving = rule.absolute or asked.everywhere or window_of(rule, asked.horizon) is not None
-        if moving or not isinstance(node, ir.Temporal) or node.window.hi is not None or endless(node.body):
+        if moving or node is None or any(part.endless for part in node.operands):
+            return None
+        if node.op not in ("always", "eventually"):
             return None
         bodies = []
         for each in (rule, asked.deciding):
-            body = each.formula.body  # type: ignore[union-attr]
-            inner = replace(each, formula=body, lowered=body, reach=reach(body).future)
+            (body,) = each.formula.operands
+            inner = replace(each, formula=body, lowered=body, reach=body.reach.future)
             bodies.append(GrowingBounds(inner, asked.horizon, "open"))
         choose, lo = np.minimum if node.op == "always" else np.maximum, node.window.lo
         return Extremum(bodies, lo, choose, asked.begin + lo, np.full((1, 4), neutral(PICKS[node.op])))
@@ -246,7 +245,7 @@ def _require_bounded(asked: Asked) -> None:
         UsageError: E313, every instant reads too many values in a `freeze`, which no other instant reads.
     """
     rule, many = asked.rule, 1
-    if asked.everywhere or endless(rule.formula):
+    if asked.everywhere or rule.formula.endless:
         many = _span(rule.formula) + (window_of(rule, asked.horizon) or 0)
     work, heaviest = _own(rule.formula, many)
     if work > MOST:
@@ -258,15 +257,15 @@ def _require_bounded(asked: Asked) -> None:
 
 def _span(formula: ir.Formula) -> int:
     """Samples that a formula reads around an instant; `[a, inf)` counts as `a` samples."""
-    return sum(own_span(formula)) + max(map(_span, operands(formula)), default=0)
+    return sum(formula.own_reach) + max(map(_span, formula.operands), default=0)
 
 
 def _own(formula: ir.Formula, instants: int) -> tuple[int, ir.Formula]:
     """Values that only one of several instants reads, and the `freeze` that reads most of them."""
-    if isinstance(formula, ir.Freeze):
-        return instants * (_FROZEN + _span(formula.body) * sum(1 for _ in numbers(formula.body))), formula
-    window = formula.window if isinstance(formula, ir.Windowed) else ir.Window(0, 0)
-    inner = instants + (window.hi or 0) - window.lo if window.hi is not None else instants
-    return max(
-        (_own(part, inner) for part in operands(formula)), key=lambda own: own[0], default=(0, formula)
-    )
+    if formula.own_numbers and formula.operands:  # a `freeze`
+        (body,) = formula.operands
+        return instants * (_FROZEN + _span(body) * sum(1 for _ in body.numbers())), formula
+    inner, operator = instants, formula.windowed
+    if operator is not None and operator.window.hi is not None:
+        inner += operator.window.hi - operator.window.lo
+    return max((_own(part, inner) for part in formula.operands), key=lambda own: own[0], default=(0, formula))

@@ -12,9 +12,6 @@ import numpy as np
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import endless, farthest, reach
-from stlc.compile.ir.support import history as lookback
-from stlc.compile.ir.traverse import numbers
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.monitor.explain.report import Cause, cause_of
 from stlc.monitor.instants import rule_bounds, window_of
@@ -70,7 +67,7 @@ class TraceBuffer:
         if excerpt is None:
             return None
         first, start, env = excerpt
-        record, grid = Record.of(env, NUMPY), self.compiled.grid
+        record, grid = Record.of(env), self.compiled.grid
         low, high = rule_bounds(rule, record, range(start, start + 1), grid.horizon, "open")
         if first and high[0, 0] != worst.high:
             return None
@@ -114,19 +111,19 @@ class TraceBuffer:
 
 def _endless_always(rule: CompiledRequirement, formula: ir.Formula) -> bool:
     """True if `formula` is an unbounded `always` of bounded windows, outside of planning windows."""
+    operator = formula.unbounded
     return (
-        isinstance(formula, ir.Temporal)
-        and formula.op == "always"
-        and formula.window.hi is None
+        operator is not None
+        and operator.op == "always"
         and not rule.windowed
-        and not endless(formula.body)
+        and not any(part.endless for part in operator.operands)
     )
 
 
 def _around(rule: CompiledRequirement, formula: ir.Formula, horizon: int | None) -> tuple[int, int] | None:
     """Numbers of samples before and after an instant that determine a value; None if they are unbounded."""
     window = window_of(rule, horizon)
-    if rule.absolute or (window is None and endless(formula) and not _endless_always(rule, formula)):
+    if rule.absolute or (window is None and formula.endless and not _endless_always(rule, formula)):
         return None
-    later = max((farthest(num).future for num in numbers(formula)), default=0)
-    return lookback(formula), max(reach(formula).future, window or 0) + later
+    later = max((num.farthest.future for num in formula.numbers()), default=0)
+    return formula.history, max(formula.reach.future, window or 0) + later

@@ -27,7 +27,7 @@ from stlc.dynamics.declaration.perturbable import perturbable
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
 from stlc.dynamics.uncertainty.perturbed import PerturbedSystem
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 PLANS = 4
@@ -42,7 +42,7 @@ class Case:
     def __init__(self, seed: int) -> None:
         self.plant = uncertain_plant(seed, listed=bool(seed % 2))
         self.rng = np.random.default_rng(seed)
-        self.task = Task.of(parse(Source("plant.stl", self.plant.spec)), self.plant.system())
+        self.task = Task.of(Spec.parse(Source("plant.stl", self.plant.spec)), self.plant.system())
         self.tubes = TubeModel(self.task)
         share = self.rng.uniform(-1, 1, (PLANS, self.task.horizon, 1))
         self.plans = torch.from_numpy(share)
@@ -141,7 +141,7 @@ def unproved(seed: int, count: int) -> list[str]:
     text = re.sub(r"(?m)^test: .*\n", "", text).replace("const:\nstate:", "state:")
     text = text.replace("control:\n", "\n".join(["param:", *ranges, "control:\n"]))
     system = System(parse_system(Source("drawn.yaml", text), Path("drawn.yaml")))
-    task = Task.of(parse(Source("plant.stl", plant.spec)), system)
+    task = Task.of(Spec.parse(Source("plant.stl", plant.spec)), system)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         network = PlanNetwork(task, hidden=(8, 8), plans=2, varied=True).eval()
@@ -229,7 +229,7 @@ def test_two_hundred_plants_have_parameters_in_every_place() -> None:
 def test_a_parameter_whose_error_cannot_be_carried_is_refused_by_name(seed: int) -> None:
     plant = uncertain_plant(seed, listed=True, refused=list(REFUSED)[seed])
     (name,) = (name for name, place in plant.places.items() if place in REFUSED)
-    task = Task.of(parse(Source("plant.stl", plant.spec)), plant.system())
+    task = Task.of(Spec.parse(Source("plant.stl", plant.spec)), plant.system())
     for use in (TubeModel, Certifier, deployed):
         with pytest.raises(SystemFileError) as caught:
             use(task)

@@ -23,7 +23,7 @@ from stlc.dynamics.system import System
 from stlc.dynamics.uncertainty.disturbance import Disturbance, ErrorSizes
 from stlc.dynamics.uncertainty.perturbed import PerturbedSystem
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 ROOT = Path(__file__).parents[3]
@@ -68,13 +68,13 @@ require turns: eventually[0, 1 s] (v < 0 and always[0, 0.2 s] p > -4 m)
 @cache
 def cart(scenario: str | None) -> Task:
     decl = parse_system(Source("cart.yaml", CART), Path("cart.yaml"), {})
-    return Task.of(parse(Source("cart.stl", SPEC)), System(under(decl, scenario) if scenario else decl))
+    return Task.of(Spec.parse(Source("cart.stl", SPEC)), System(under(decl, scenario) if scenario else decl))
 
 
 @cache
 def task_of(spec: str, system: str, scenario: str) -> Task:
     files = ROOT / "specs" / f"{spec}.stl", ROOT / "examples" / f"{system}.yaml"
-    return Task.of(parse(File(files[0]).read()), System.load(files[1], scenario=scenario))
+    return Task.of(Spec.parse(File(files[0]).read()), System.load(files[1], scenario=scenario))
 
 
 class Sampled:
@@ -201,7 +201,7 @@ def test_after_the_steps_with_errors_the_model_is_followed(steps: int) -> None:
 def test_inner_feedback_is_part_of_the_tube() -> None:
     files = (ROOT / "examples" / "tasks" / f"cart_pole.{end}" for end in ("stl", "yaml"))
     spec, system = next(files), System.load(next(files), scenario="mismatch-5")
-    task = Task.of(parse(File(spec).read()), system)
+    task = Task.of(Spec.parse(File(spec).read()), system)
     assert task.plain.decl.feedback is not None
     check(task, 40, steps=3, plans=4)
 

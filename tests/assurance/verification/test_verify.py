@@ -24,7 +24,7 @@ from stlc.diagnostics import UsageError
 from stlc.dynamics.declaration.init import GridDecl, InitDecl, Situation
 from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 
@@ -252,7 +252,7 @@ policy:
 def test_mirrored_angles_are_wrapped_into_a_turn(tmp_path: Path, angle: float) -> None:
     (tmp_path / "turning.yaml").write_text(TURNING)
     text = Source("turning.stl", "signal x, h\nrequire r: always[0 s, 1 s] h < 2")
-    task = Task.of(parse(text), System.load(tmp_path / "turning.yaml"))
+    task = Task.of(Spec.parse(text), System.load(tmp_path / "turning.yaml"))
     network = PlanNetwork(task, hidden=(2,), plans=1).eval()
     with torch.no_grad():
         network.body[-1].weight.zero_()

@@ -25,7 +25,7 @@ from stlc.export.programs import Deciding, Guarding
 from stlc.export.verify import answers
 from stlc.export.write import export
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.runtime import Controller
 
 pytestmark = pytest.mark.apart
@@ -66,7 +66,7 @@ SOME = ("ppo", *(pytest.param(method, marks=pytest.mark.slow) for method in ("sa
 
 
 def run_of(files: tuple[Path, Path], folder: Path, method: str) -> Run:
-    task = Task.of(parse(File(files[0]).read()), System.load(files[1]))
+    task = Task.of(Spec.parse(File(files[0]).read()), System.load(files[1]))
     opened = open_folder(task, TrainConfig(steps=1), Launch(root=folder, name="test"))
     return Run(opened, task, ActorPolicy(task, ACTORS[method](task)))
 

@@ -15,7 +15,7 @@ from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.dynamics.system import System
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 
 ROOT = Path(__file__).parents[3]
 
@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[3]
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A run of ship_safe that has not begun: the guarantee is of the grid, not of the policy."""
     monkeypatch.chdir(tmp_path)
-    spec = parse(File(ROOT / "specs" / "ship_safe.stl").read())
+    spec = Spec.parse(File(ROOT / "specs" / "ship_safe.stl").read())
     task = Task.of(spec, System.load(ROOT / "examples" / "ship_safe.yaml"))
     return open_folder(task, TrainConfig(steps=1), Launch(root=tmp_path / "runs")).path
 

@@ -16,7 +16,7 @@ from stlc.cli.framework.app import main
 from stlc.controller.deployment.batched import Setting
 from stlc.controller.evaluation.rules import Rules
 from stlc.controller.run.run import Run
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.rundir import RunDir
 from stlc.source import Source
 from stlc.trace import Trace
@@ -131,7 +131,7 @@ def test_a_drive_that_violates_an_assumption_violates_no_requirement():
     points = np.random.default_rng(0).random((8, simulator.space.dim))
     every = simulator.judge(simulator.drive(points)).margins
     assumed = DriveSimulator(simulator.run, simulator.guard, simulator.setting)
-    spec = parse(Source("cart.stl", SPEC + "assume left: x <= 0 m\n"))
+    spec = Spec.parse(Source("cart.stl", SPEC + "assume left: x <= 0 m\n"))
     assumed.__dict__["_rules"] = Rules(spec, "cart.stl")
     recording = assumed.drive(points)
     left = (recording.states[:, 0, 0] <= 0.0).reshape(8, 2)

@@ -19,12 +19,12 @@ from helpers.several import ENVIRONMENT, free_port
 from stlc.cli.framework.app import main
 from stlc.controller.training.config import TrainConfig
 from stlc.diagnostics import CODES, StlcError
-from stlc.grammar.manual import FOLDER, Example, Page, read_page
+from stlc.grammar.manual import FOLDER, Example, Page
 from stlc.grammar.tables import load_parser
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).resolve().parents[3]
-PAGES = {code: read_page(code) for code in CODES}
+PAGES = {code: Page.read(code) for code in CODES}
 
 
 def having(page: Page, note: str) -> tuple[Example, ...]:

@@ -7,7 +7,7 @@ import pytest
 from helpers.walks import walk
 
 from stlc.cli.framework.app import main
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 from stlc.trace import Trace
@@ -79,7 +79,7 @@ def test_what_is_violated_is_never_an_empty_panel(tmp_path, capsys):
 def test_a_file_without_units_is_labelled_with_those_of_the_specification(tmp_path):
     (tmp_path / "tank.csv").write_text("t,level\n0,1\n1,2\n2,3\n")
     trace = Trace.load(tmp_path / "tank.csv")
-    told = _as_declared(trace, parse(Source("tank.stl", TANK)))
+    told = _as_declared(trace, Spec.parse(Source("tank.stl", TANK)))
     assert (trace.signature["level"].unit.text, told.signature["level"].unit.text) == ("", "m")
 
 

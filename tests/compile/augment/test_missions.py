@@ -13,7 +13,7 @@ from proof.missions import check_margins, check_mission, check_nested, check_pas
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 seeds = st.integers(0, 2**32 - 1)
@@ -81,6 +81,6 @@ def test_a_recorded_trace_is_judged_as_defined(formula: typed.Formula, seed: int
     ],
 )
 def test_the_text_of_a_status_is_true(body, text):
-    spec = parse(Source("s.stl", f"signal x [m]\nrequire r: eventually@[0 s, 5 s] {body}\n"))
+    spec = Spec.parse(Source("s.stl", f"signal x [m]\nrequire r: eventually@[0 s, 5 s] {body}\n"))
     compiled = compile_spec(spec, grid=Grid(Fraction(1, 10), 10), interface=None)
     assert any(text in timer.about for timer in compiled.timers)

@@ -15,7 +15,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import Compiled, compile_spec
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 WINDOW, END, BATCH = 5, 17, 200
@@ -40,7 +40,7 @@ FROM_START = (
 
 def compiled(requirement: str, grid: Grid, tag: str = "") -> Compiled:
     text = f"signal x, y\n{tag}\nrequire a: {requirement}\n"
-    return compile_spec(parse(Source("s.stl", text)), grid=grid)
+    return compile_spec(Spec.parse(Source("s.stl", text)), grid=grid)
 
 
 def columns(seed: int) -> dict[str, np.ndarray]:
@@ -66,7 +66,7 @@ def test_every_plan_satisfies_it_iff_every_window_of_the_mission_does(
     signals = columns(seed)
     grid = Grid(Fraction(1, 10), WINDOW)
     windows = compile_spec(
-        parse(Source("s.stl", f"signal x, y\nrequire a: {requirement}\n")), grid=grid, purpose="check"
+        Spec.parse(Source("s.stl", f"signal x, y\nrequire a: {requirement}\n")), grid=grid, purpose="check"
     )
     count = STARTS if requirement in ON_WINDOWS else 1
     mission = {name: each[: END + 1] for name, each in signals.items()}

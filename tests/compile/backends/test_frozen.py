@@ -18,7 +18,6 @@ from stlc.compile.backends.schedule import IndexRange, TraceDomain, spanning
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.lower import lower
 from stlc.compile.ir.simplify import simplify
 from stlc.diagnostics import TraceError
 
@@ -43,7 +42,7 @@ def expected(formula: typed.Formula, env: Env, end: str, side: int = 0) -> np.nd
 
 def lowered(formula: typed.Formula) -> ir.Formula:
     sink: list = []
-    out = lower(formula, GRID, sink)
+    out = GRID.lower(formula, sink)
     assert not sink
     return out
 

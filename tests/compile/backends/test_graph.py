@@ -16,9 +16,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.lower import lower
 from stlc.compile.ir.simplify import simplify
-from stlc.compile.ir.traverse import nodes, operands
 from stlc.compile.semantics.semantics import Exact, LogSumExp, Semantics
 from stlc.signature import Column, Signature
 
@@ -28,7 +26,7 @@ PAST = (ir.PastTemporal, ir.Since)
 
 def lowered(formula: typed.Formula) -> ir.Formula:
     sink: list = []
-    out = lower(formula, GRID, sink)
+    out = GRID.lower(formula, sink)
     assert not sink
     return out
 
@@ -95,7 +93,7 @@ def test_both_bounds_at_once(formula: typed.Formula, env: Env) -> None:
 def test_bounds_hold_for_every_continuation(formula: typed.Formula, env: Env, seed: int, more: int) -> None:
     """A longer trace stays within the bounds of its prefix, `end` apart, which then is another sample."""
     node = lowered(formula)
-    if any(getattr(n, "window", ir.Window(0, 0)).hi is None for n in nodes(node) if not isinstance(n, PAST)):
+    if any(getattr(n, "window", ir.Window(0, 0)).hi is None for n in node.walk() if not isinstance(n, PAST)):
         return
     rng = np.random.default_rng(seed)
     longer = {name: np.concatenate([c, rng.normal(size=(more, c.shape[1]))]) for name, c in env.items()}
@@ -202,7 +200,7 @@ def test_smooth_is_near_exact(formula: typed.Formula, env: Env, k: float) -> Non
 
 def looseness(node: ir.Formula, samples: int) -> float:
     """Sum along the deepest path of log(number of operands): how far nested smooth operators may be off."""
-    inner = max((looseness(part, samples) for part in operands(node)), default=0.0)
+    inner = max((looseness(part, samples) for part in node.operands), default=0.0)
     match node:
         case ir.BoolOp(_, items):
             return inner + math.log(len(items))

@@ -31,9 +31,7 @@ from stlc.compile.backends.array.interval_ops import INTERVALS, IntervalOps, _an
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
-from stlc.compile.ir.lower import lower
 from stlc.compile.ir.simplify import simplify
-from stlc.compile.ir.traverse import nodes
 from stlc.compile.namespace import Ops, Sliding
 from stlc.compile.semantics.kinds.smooth import LogSumExp
 from stlc.compile.semantics.switch import StraightThrough, Tanh
@@ -415,7 +413,7 @@ def check_formula(
         (point,) = evaluate([formula], env, ops=NUMPY, end=end, count=count)
         defined = ~np.isnan(point)
         assert ((found.low <= point) & (point <= found.high))[defined].all()
-    jumps = any(isinstance(node, ir.Predicate) and node.guard for node in nodes(formula))
+    jumps = any(isinstance(node, ir.Predicate) and node.guard for node in formula.walk())
     if not width and not jumps:
         np.testing.assert_allclose(found.low, point, rtol=0, atol=1e-12)
         np.testing.assert_allclose(found.high, point, rtol=0, atol=1e-12)
@@ -439,7 +437,7 @@ any_trace = random_formulas.traces(1, 14, 3)
 
 
 def lowered(written: Any) -> ir.Formula:
-    return simplify(lower(written, random_formulas.GRID, []))
+    return simplify(random_formulas.GRID.lower(written, []))
 
 
 @settings(max_examples=48, deadline=None)

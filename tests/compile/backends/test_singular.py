@@ -19,7 +19,6 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
-from stlc.compile.ir.traverse import leaves, nodes, subexpressions
 from stlc.compile.semantics.semantics import Exact, LogSumExp, Semantics, semantics_of
 from stlc.controller.problem.kernel import ObjectiveSlopes
 from stlc.native import compiler
@@ -130,12 +129,12 @@ def differences(rule: ir.Formula, at: NDArray[np.float64], semantics: Semantics)
 
 def kinked(rule: ir.Formula, at: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Traces (batch,) on which a part of the formula has a kink: a tie, or a condition with margin 0."""
-    margins = [node.num for node in nodes(rule) if isinstance(node, ir.Predicate)]
+    margins = [node.num for node in rule.walk() if isinstance(node, ir.Predicate)]
     gaps: list[ir.Num] = []
-    for num in (part for margin in margins for part in subexpressions(margin)):
+    for num in (part for margin in margins for part in margin.subexpressions()):
         match num:
             case ir.Where(cond) | ir.Indicator(cond):
-                gaps += [each.num for each in nodes(cond) if isinstance(each, ir.Predicate)]
+                gaps += [each.num for each in cond.walk() if isinstance(each, ir.Predicate)]
             case ir.Op("min" | "max" | "clip", args):
                 gaps += [ir.Op("sub", pair) for pair in combinations(args, 2)]
             case ir.Op("abs" | "relu" | "norm" | "sqrt" | "pow" | "atan2", args):
@@ -195,9 +194,9 @@ def undefined(rule: ir.Formula, at: NDArray[np.float64]) -> bool:
     It may be, too, if a part of it is constant; compiled specifications have no such parts.
     """
     env = {name: at[:, :, i] for i, name in enumerate(NAMES)}
-    margins = [node.num for node in nodes(rule) if isinstance(node, ir.Predicate)]
-    inner = {part for num in margins for part in subexpressions(num) if not isinstance(part, ir.Const)}
-    constant = any(all(isinstance(leaf, ir.Const) for leaf in leaves(part)) for part in inner)
+    margins = [node.num for node in rule.walk() if isinstance(node, ir.Predicate)]
+    inner = {part for num in margins for part in num.subexpressions() if not isinstance(part, ir.Const)}
+    constant = any(all(isinstance(leaf, ir.Const) for leaf in part.leaves()) for part in inner)
     return constant or any(np.isnan(ArrayProgram({"": num})(env, NUMPY)[""]).any() for num in margins)
 
 

@@ -8,7 +8,8 @@ from stlc.cli.framework.render import render_text
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.resolve import resolve
 from stlc.diagnostics import CODES, Diagnostic, SpecError
-from stlc.grammar.parser import MAX_ERRORS, parse
+from stlc.grammar.parser import MAX_ERRORS
+from stlc.grammar.spec import Spec
 from stlc.signature import Column, Signature
 from stlc.source import Source
 from stlc.units import Unit
@@ -51,7 +52,7 @@ def findings(text: str, name: str = "specs/spec.stl", interface: Interface | Non
     """Warnings, and then errors if there are any."""
     sink: list[Diagnostic] = []
     try:
-        resolve(parse(Source(name, text)), interface=interface, sink=sink)
+        resolve(Spec.parse(Source(name, text)), interface=interface, sink=sink)
     except SpecError as error:
         return [*sink, *error.diagnostics]
     return sink

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from stlc.compile.frontend.resolve import resolve
 from stlc.diagnostics import CODES, Diagnostic, SpecError
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 DEFS = """
@@ -109,7 +109,7 @@ def _grown(inner):
 @example("p in union(disc, complement(disc))", "require r:")
 def test_never_a_crash(text: str, keyword: str) -> None:
     try:
-        syntax = parse(Source("specs/spec.stl", f"{HEAD}{DEFS}\n{keyword} {text}\n"))
+        syntax = Spec.parse(Source("specs/spec.stl", f"{HEAD}{DEFS}\n{keyword} {text}\n"))
     except SpecError:
         return
     try:
@@ -129,7 +129,7 @@ def test_what_doubles_on_every_level_is_refused(grown: str) -> None:
     text = "x > 0"
     for _ in range(40):
         text = grown.format(text)
-    syntax = parse(Source("specs/spec.stl", f"{HEAD}\nrequire r: {text}\n"))
+    syntax = Spec.parse(Source("specs/spec.stl", f"{HEAD}\nrequire r: {text}\n"))
     error, spent = refused(lambda: resolve(syntax, sink=[]), SpecError)
     assert [finding.code for finding in error.diagnostics] == ["E005"]
     assert spent < 1_000_000
@@ -148,7 +148,7 @@ def test_what_doubles_on_every_level_is_refused(grown: str) -> None:
 )
 def test_what_only_the_unit_makes_too_large(items: str) -> None:
     with pytest.raises(SpecError) as caught:
-        resolve(parse(Source("specs/spec.stl", f"{HEAD}\n{items}\n")), sink=[])
+        resolve(Spec.parse(Source("specs/spec.stl", f"{HEAD}\n{items}\n")), sink=[])
     assert [finding.code for finding in caught.value.diagnostics] == ["E005"]
 
 
@@ -157,7 +157,7 @@ def test_what_only_the_unit_makes_too_large(items: str) -> None:
 def test_twice_as_many_errors_take_twice_the_work(line: str) -> None:
     def found(count: int) -> int:
         text = HEAD + "\n".join(line.format(number) for number in range(count))
-        syntax = parse(Source("specs/spec.stl", text))
+        syntax = Spec.parse(Source("specs/spec.stl", text))
         error, spent = refused(lambda: resolve(syntax, sink=[]), SpecError)
         assert f"{count - 20} more errors" in error.diagnostics[-1].note[-1]
         return spent
@@ -168,7 +168,7 @@ def test_twice_as_many_errors_take_twice_the_work(line: str) -> None:
 def test_twice_as_many_warnings_take_twice_the_work() -> None:
     def found(count: int) -> int:
         text = HEAD + "\n".join(f"require r{number}: always[0, {number}] x > 0 m" for number in range(count))
-        syntax = parse(Source("specs/spec.stl", text))
+        syntax = Spec.parse(Source("specs/spec.stl", text))
         warnings: list[Diagnostic] = []
         spent = effort(lambda: resolve(syntax, sink=warnings))
         assert [finding.code for finding in warnings] == ["W101"] * (count - 1)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import Diagnostic, SpecError
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.lint.lint import lint
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
@@ -33,7 +33,7 @@ def recorded(dt: float) -> Trace:
 
 
 def compiled(text: str, grid: Grid = TENTH) -> object:
-    return compile_spec(parse(source(text)), grid=grid, purpose="check").requirements[0].formula
+    return compile_spec(Spec.parse(source(text)), grid=grid, purpose="check").requirements[0].formula
 
 
 def finding(text: str, grid: Grid) -> Diagnostic:

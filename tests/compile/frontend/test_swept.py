@@ -18,7 +18,6 @@ from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
-from stlc.compile.ir.lower import lower
 
 GRID = Grid()
 L_SHAPE = "polygon([0, 0], [4, 0], [4, 1], [1, 1], [1, 3], [0, 3])"
@@ -78,7 +77,7 @@ _FORMULAS: dict[str, ir.Formula] = {}
 
 def robustness(text: str, env: dict[str, np.ndarray]) -> float:
     if text not in _FORMULAS:
-        _FORMULAS[text] = lower(formula(text), GRID, [])
+        _FORMULAS[text] = GRID.lower(formula(text), [])
     return float(evaluate([_FORMULAS[text]], env, ops=NUMPY)[0][0, 0])
 
 
@@ -136,8 +135,8 @@ def test_unions_and_intersections(now, then) -> None:
 @given(st.lists(coordinate, min_size=1, max_size=6))
 def test_a_number_sweeps_a_range(values) -> None:
     env = {"x": np.array(values)[:, None]}
-    inside = robustness_signal(lower(formula("sweep(x) in [-1, 2]"), GRID, []), env, ops=NUMPY)[:, 0]
-    outside = robustness_signal(lower(formula("sweep(x) not in [-1, 2]"), GRID, []), env, ops=NUMPY)[:, 0]
+    inside = robustness_signal(GRID.lower(formula("sweep(x) in [-1, 2]"), []), env, ops=NUMPY)[:, 0]
+    outside = robustness_signal(GRID.lower(formula("sweep(x) not in [-1, 2]"), []), env, ops=NUMPY)[:, 0]
     for t, value in enumerate(values):
         ends = sorted((value, values[min(t + 1, len(values) - 1)]))
         assert inside[t] == pytest.approx(min(ends[0] + 1, 2 - ends[1]))
@@ -147,7 +146,7 @@ def test_a_number_sweeps_a_range(values) -> None:
 
 def test_at_the_last_sample_it_is_the_point_itself() -> None:
     env = {"p[0]": np.array([[-3.0], [3.0]]), "p[1]": np.zeros((2, 1))}
-    node = lower(formula("sweep(p) not in circle([0, 0], 1)"), GRID, [])
+    node = GRID.lower(formula("sweep(p) not in circle([0, 0], 1)"), [])
     for end in ("strict", "truncate", "lower", "upper"):
         signal = robustness_signal(node, env, ops=NUMPY, end=end)
         np.testing.assert_allclose(signal[:, 0], [-1.0, 2.0])
@@ -164,7 +163,7 @@ def test_what_jumps_over_a_wall_is_caught() -> None:
 def test_gradients_are_central_differences(region) -> None:
     rng = np.random.default_rng(5)
     for text in (f"sweep(p) in {region}", f"sweep(p) not in {region}"):
-        node = lower(formula(text), GRID, [])
+        node = GRID.lower(formula(text), [])
         env = {name: rng.normal(size=(2, 40)) * 2 for name in ("p[0]", "p[1]", "x", "y")}
         tensors = {name: torch.tensor(x, requires_grad=True) for name, x in env.items()}
         (rho,) = evaluate([node], tensors, ops=TORCH)
@@ -187,7 +186,7 @@ def test_standing_still_does_no_harm_to_gradients() -> None:
                 name: torch.full((2, 1), value, dtype=dtype, requires_grad=True)
                 for name, value in (("p[0]", 0.4), ("p[1]", 0.3), ("x", 0.1), ("y", -0.2))
             }
-            (rho,) = evaluate([lower(formula(f"sweep(p) not in {region}"), GRID, [])], tensors, ops=TORCH)
+            (rho,) = evaluate([GRID.lower(formula(f"sweep(p) not in {region}"), [])], tensors, ops=TORCH)
             rho.sum().backward()
             grads = [tensor.grad for tensor in tensors.values() if tensor.grad is not None]
             assert all(torch.isfinite(grad).all() for grad in grads)

@@ -14,11 +14,8 @@ from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
-from stlc.compile.ir.lower import lower
-from stlc.compile.ir.support import columns_in
-from stlc.compile.ir.traverse import nodes
 from stlc.compile.pipeline import compile_spec
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 SIGNALS = """
@@ -30,7 +27,7 @@ signal n in [0, 5]
 
 
 def robustness(node: typed.Formula, **values: float) -> float:
-    lowered = lower(node, Grid(), [])
+    lowered = Grid().lower(node, [])
     env = {name: np.array([[value]]) for name, value in values.items()}
     return float(evaluate([lowered], env, ops=NUMPY)[0][0, 0])
 
@@ -89,7 +86,7 @@ def test_a_range_of_whole_numbers_and_sums_of_them() -> None:
 
 
 def warnings(text: str, purpose: str = "train") -> list[str]:
-    parsed = parse(Source("a.stl", SIGNALS + text))
+    parsed = Spec.parse(Source("a.stl", SIGNALS + text))
     compiled = compile_spec(parsed, grid=Grid(Fraction(1, 10), 20), purpose=purpose)
     return [finding.code for finding in compiled.warnings]
 
@@ -108,4 +105,4 @@ def test_what_looks_before_a_plan_is_told_so() -> None:
         warnings("require a: always[0, T] delta(x) < 1 m")
     assert warnings("require a: always[1 steps, T] delta(x) < 1 m") == []
     node = formula("always[1 steps, 3 steps] delta(x) < 1")
-    assert [columns_in(part.num) for part in nodes(node) if isinstance(part, typed.Predicate)] == [{"x"}]
+    assert [part.num.columns for part in node.walk() if isinstance(part, typed.Predicate)] == [{"x"}]

@@ -6,7 +6,7 @@ import pytest
 
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 
@@ -53,5 +53,5 @@ def test_room(formula: str) -> None:
 
 
 def test_training_says_it_too() -> None:
-    spec = parse(Source("s.stl", f"{HEAD}require r: x > 1 m and x < 0.5 m\n"))
+    spec = Spec.parse(Source("s.stl", f"{HEAD}require r: x > 1 m and x < 0.5 m\n"))
     assert "W505" in [finding.code for finding in compile_spec(spec, grid=Grid(None, None)).warnings]

@@ -14,8 +14,6 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.defined import defined
 from stlc.compile.ir.discretize import Grid
-from stlc.compile.ir.lower import lower
-from stlc.compile.ir.support import reach
 from stlc.compile.ir.text import show_formula
 from stlc.diagnostics import Diagnostic
 
@@ -32,7 +30,7 @@ def between(lo: str, hi: str | None, opened: str = "[]") -> typed.Interval:
 
 def lowered(formula: typed.Formula, grid: Grid = GRID) -> tuple[str, list[Diagnostic]]:
     sink: list[Diagnostic] = []
-    return show_formula(lower(formula, grid, sink)), sink
+    return show_formula(grid.lower(formula, sink)), sink
 
 
 def codes(formula: typed.Formula, grid: Grid = GRID) -> list[str]:
@@ -79,7 +77,7 @@ def test_negation_sinks_into_predicates(formula: typed.Formula, text: str) -> No
 
 
 def test_shift_of_an_edge_is_false_at_the_first_sample() -> None:
-    rise = lower(typed.Edge(SPAN, "rise", X), GRID, [])
+    rise = GRID.lower(typed.Edge(SPAN, "rise", X), [])
     assert isinstance(rise, ir.BoolOp)
     assert isinstance(rise.items[1], ir.Shift)
     assert rise.items[1].outside is False
@@ -167,7 +165,7 @@ def test_unless_in_unless_is_lowered_twice_not_three_times() -> None:
         formula: typed.Formula = X
         for _ in range(depth):
             formula = typed.Until(SPAN, "unless", between("0", "0.1"), formula, Y)
-        return effort(lambda: lower(formula, GRID, []))
+        return effort(lambda: GRID.lower(formula, []))
 
     assert work(9) < 2.5**2 * work(7)
 
@@ -176,8 +174,8 @@ def test_an_absolute_interval_is_judged_at_the_first_sample_wherever_it_stands()
     early = typed.Temporal(SPAN, "eventually", replace(between("0", "0.2"), clock="start"), X)
     formula = typed.Until(SPAN, "until", between("0", "0.1"), Y, typed.Not(SPAN, early))
     assert lowered(formula)[0] == "y >= 0 until[0..1] at the start (always[0..2] x <= 0)"
-    node = lower(formula, GRID, [])
-    assert reach(node).future == 2
+    node = GRID.lower(formula, [])
+    assert node.reach.future == 2
     x, y = np.array([-1.0, -2.0, -3.0, 4.0])[:, None], np.ones((4, 1))
     np.testing.assert_array_equal(defined(node, 4), [True, True, True, False])
     value = robustness_signal(node, {"x": x, "y": y}, ops=NUMPY, end="truncate")

@@ -10,9 +10,6 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.defined import defined
-from stlc.compile.ir.lower import lower
-from stlc.compile.ir.support import columns_in, reach, uses_end
-from stlc.compile.ir.traverse import nodes
 
 P, Q = ir.Predicate(ir.Signal("p")), ir.Predicate(ir.Signal("q"))
 
@@ -31,24 +28,24 @@ P, Q = ir.Predicate(ir.Signal("p")), ir.Predicate(ir.Signal("q"))
     ],
 )
 def test_reach(formula: ir.Formula, past: int, future: int, end: bool) -> None:
-    assert reach(formula) == (past, future)
-    assert uses_end(formula) is end
+    assert formula.reach == (past, future)
+    assert formula.uses_end is end
 
 
 def test_columns_of_conditions_inside_numbers() -> None:
     num = ir.Op("add", (ir.Where(P, ir.Signal("a"), ir.Const(1.0)), ir.Indicator(Q)))
-    assert columns_in(ir.Temporal("always", ir.Window(0, 1), ir.Predicate(num))) == {"p", "q", "a"}
+    assert ir.Temporal("always", ir.Window(0, 1), ir.Predicate(num)).columns == {"p", "q", "a"}
 
 
 @settings(max_examples=36)
 @given(formulas(bounded_only=True), traces(high=24))
 def test_nothing_beyond_the_reach_is_read(formula: typed.Formula, env: dict[str, np.ndarray]) -> None:
     """A bounded formula has a value exactly where its reach fits, and samples beyond do not change it."""
-    node = lower(formula, GRID, [])
+    node = GRID.lower(formula, [])
     samples = len(env["x"])
-    past, future = reach(node)
+    past, future = node.reach
     inside = defined(node, samples)
-    if not any(isinstance(part, (ir.PastTemporal, ir.Since, ir.Shift)) for part in nodes(node)):
+    if not any(isinstance(part, (ir.PastTemporal, ir.Since, ir.Shift)) for part in node.walk()):
         np.testing.assert_array_equal(inside, np.arange(samples) < samples - future)
     assert inside[past : max(samples - future, 0)].all()
     changed = {name: column.copy() for name, column in env.items()}

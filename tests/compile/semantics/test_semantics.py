@@ -15,7 +15,6 @@ from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import typed
-from stlc.compile.ir.lower import lower
 from stlc.compile.namespace import Ops
 from stlc.compile.semantics.semantics import (
     SEMANTICS,
@@ -97,7 +96,7 @@ def plain(x: np.ndarray | torch.Tensor) -> np.ndarray:
 @settings(max_examples=18)
 @given(formulas(truth=False), traces(high=16))
 def test_sound_semantics_keep_the_sign(semantics: Semantics, formula: typed.Formula, env: Env) -> None:
-    node = lower(formula, GRID, [])
+    node = GRID.lower(formula, [])
     exact = robustness_signal(node, env, ops=NUMPY, end="truncate")
     value = robustness_signal(node, env, ops=NUMPY, semantics=semantics, end="truncate")
     assert (value[exact > 0] > 0).all()

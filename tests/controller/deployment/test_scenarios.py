@@ -23,7 +23,7 @@ from stlc.dynamics.load import parse_system
 from stlc.dynamics.scenario import standard, under
 from stlc.dynamics.system import System
 from stlc.dynamics.uncertainty.disturbance import Disturbance, errors_of
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 SYSTEM = """\
@@ -70,7 +70,7 @@ class Still(Policy):
 
 def task_of(scenario: str) -> Task:
     decl = under(parse_system(Source("boat.yaml", SYSTEM), Path("boat.yaml")), scenario)
-    return Task.of(parse(Source("a.stl", SPEC)), System(decl), overrides=decl.scenario.constants)  # type: ignore[union-attr]
+    return Task.of(Spec.parse(Source("a.stl", SPEC)), System(decl), overrides=decl.scenario.constants)  # type: ignore[union-attr]
 
 
 @pytest.fixture
@@ -261,7 +261,7 @@ def test_worlds_are_the_same_whatever_is_disturbed() -> None:
     found = []
     for scenario in ("nominal", "mismatch-20", "noise-10"):
         decl = under(parse_system(Source("boat.yaml", text), Path("boat.yaml")), scenario)
-        task, recorder = Task.of(parse(Source("a.stl", SPEC)), System(decl)), Recorder(3)  # type: ignore[arg-type]
+        task, recorder = Task.of(Spec.parse(Source("a.stl", SPEC)), System(decl)), Recorder(3)  # type: ignore[arg-type]
         simulate(Guard(task, Steady(task)), world_type(decl), Setting((0, 1), 3, 1), recorder)
         found.append(recorder.recording().states[:, 0, 0].tolist())  # type: ignore[union-attr]
     assert found[0] == found[1] == found[2]

@@ -18,7 +18,7 @@ from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 POINT = """
@@ -44,7 +44,7 @@ def driven(folder: Path, rules: str, calm: str):  # type: ignore[no-untyped-def]
     path = folder / "point.yaml"
     path.write_text(POINT if calm == "blown" else POINT.replace(POINT[POINT.index(", events") : -2], ""))
     system = System.load(path)
-    task = Task.of(parse(Source("s.stl", f"state signal x [m]\n{rules}")), system)
+    task = Task.of(Spec.parse(Source("s.stl", f"state signal x [m]\n{rules}")), system)
     recorder = Recorder(2, pictured=False)
     guard = Guard(task, Still(task), "none")
     simulate(guard, world_type(system.decl), Setting((0,), 2, 14), recorder)

@@ -32,7 +32,7 @@ from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.loop import train
 from stlc.dynamics.system import System
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.jsontext import plain
 from stlc.registry import METHODS
 from stlc.view.learning import Commands, driven_lines, recommended
@@ -44,7 +44,7 @@ SMALL = {"test.steps": "30", "test.agents": "4", "test.world": "null"}
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """An untrained car on short drives."""
-    spec = parse(File(ROOT / "specs" / "traffic.stl").read())
+    spec = Spec.parse(File(ROOT / "specs" / "traffic.stl").read())
     task = Task.of(spec, System.load(ROOT / "examples" / "car.yaml", SMALL))
     config = TrainConfig()
     folder = open_folder(task, config, Launch(root=tmp_path_factory.mktemp("runs")))
@@ -93,7 +93,7 @@ def test_seeds_are_nobody_elses() -> None:
 
 
 def test_a_training_reports_its_drives(tmp_path: Path) -> None:
-    spec = parse(File(ROOT / "specs" / "traffic.stl").read())
+    spec = Spec.parse(File(ROOT / "specs" / "traffic.stl").read())
     task = Task.of(spec, System.load(ROOT / "examples" / "car.yaml", {**SMALL, "test.judge": "null"}))
     config = TrainConfig(held_out=50, budget=0.7, clock="processor", drives=4, batch=32, seed=1)
     outcome = train(task, config, open_folder(task, config, Launch(root=tmp_path)))

@@ -15,7 +15,7 @@ from stlc.controller.search.feasibility import solvable
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.dynamics.system import System
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.rundir import RunDir
 from stlc.view.held_out import load_held_out
 
@@ -48,7 +48,7 @@ def test_what_is_known_is_kept_state_by_state(car_task: Task, tmp_path: Path) ->
 def test_what_is_feasible_hardly_depends_on_the_policy() -> None:
     """Ships that nobody has trained: where search begins with their plans alone it knows half as many."""
     root = Path(__file__).parents[3]
-    spec = parse(File(root / "specs" / "ship_track.stl").read())
+    spec = Spec.parse(File(root / "specs" / "ship_track.stl").read())
     task = Task.of(spec, System.load(root / "examples" / "ship_track.yaml"))
     engine = resolve_config(task, TrainConfig())
     with torch.random.fork_rng():

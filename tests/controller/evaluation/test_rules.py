@@ -23,7 +23,7 @@ from stlc.controller.training.launch import Launch, open_folder
 from stlc.diagnostics import RunError, SpecError, SystemFileError
 from stlc.dynamics.system import System
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.jsontext import plain
 from stlc.rundir import RunDir
 
@@ -65,7 +65,7 @@ def home(tmp_path: Path) -> Path:
 
 
 def task_of(home: Path, overrides: Mapping[str, str] | None = None) -> Task:
-    spec = parse(File(home / "car/cart.stl").read())
+    spec = Spec.parse(File(home / "car/cart.stl").read())
     return Task.of(spec, System.load(home / "car/cart.yaml", overrides or {}))
 
 
@@ -231,7 +231,7 @@ def test_who_only_comes_late_is_lost_where_no_plan_keeps_all(
     home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (home / "car/cart.stl").write_text(PLAN + "require go: always x > -99\n")
-    rules, asked = Rules(parse(text_of(home, GO)), "go.stl"), searched(monkeypatch, -1)
+    rules, asked = Rules(Spec.parse(text_of(home, GO)), "go.stl"), searched(monkeypatch, -1)
     recording = driven([[0, 1, 2], [-2, -1, 0.5], [-0.5, -0.5, 1], [-3, -1, 3.5]], good=False)
     drives = judge_runs(rules, opened(run_of(home)).task, recording, viable(4, 0, 1))
     assert asked == [  # not who obeyed; of who hit something, a safe plan until then
@@ -253,7 +253,7 @@ def test_a_drive_can_be_lost_later(home: Path, monkeypatch: pytest.MonkeyPatch, 
 
     Where events are not recorded, a step that the model does not predict counts as one.
     """
-    rules, asked = Rules(parse(text_of(home, GO)), "go.stl"), searched(monkeypatch, 9)
+    rules, asked = Rules(Spec.parse(text_of(home, GO)), "go.stl"), searched(monkeypatch, 9)
     recording = driven([[1, 2, 2.5, 3.5, 1]], good=False)
     recording.safe[0, 0] = True
     recording = replace(recording, eventless=None if calm is None else np.array([[calm, True, True, True]]))
@@ -266,14 +266,14 @@ def test_a_drive_can_be_lost_later(home: Path, monkeypatch: pytest.MonkeyPatch, 
 def test_a_plan_that_was_good_until_a_rule_was_broken_is_no_excuse(
     home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rules, asked = Rules(parse(text_of(home, GO)), "go.stl"), searched(monkeypatch, 9)
+    rules, asked = Rules(Spec.parse(text_of(home, GO)), "go.stl"), searched(monkeypatch, 9)
     drives = judge_runs(rules, opened(run_of(home)).task, driven([[1, 2, 3.5, 1]]), viable(1, 0))
     assert (asked, drives.broken[0].lost, drives.viable.tolist()) == ([], None, [True])
 
 
 def test_a_drive_that_ends_too_early_is_neither(home: Path) -> None:
     text = "spec soon\nsignal x [m]\nrequire soon: eventually[0 s, 5 s] x > 1\n"
-    rules = Rules(parse(text_of(home, text)), "soon.stl")
+    rules = Rules(Spec.parse(text_of(home, text)), "soon.stl")
     task = opened(run_of(home)).task
     document = plain(
         JudgedRuns.of(judge_runs(rules, task, driven([[0, 2, 0], [0, 0, 0]]), viable(2)), (0,), 2)

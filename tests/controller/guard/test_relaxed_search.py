@@ -16,7 +16,7 @@ from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 SYSTEM = """\
@@ -42,7 +42,7 @@ LIMITS = Limits(seconds=None, margin={"clear": 0.6, "behind": 0.6})
 
 def cart() -> Task:
     decl = parse_system(Source("cart.yaml", SYSTEM), Path("cart.yaml"))
-    return Task.of(parse(Source("a.stl", SPEC)), System(decl))  # type: ignore[arg-type]
+    return Task.of(Spec.parse(Source("a.stl", SPEC)), System(decl))  # type: ignore[arg-type]
 
 
 class Onward(Policy):

@@ -12,7 +12,7 @@ from stlc.controller.guard.search import StagedSearch
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 SYSTEM = """\
@@ -33,7 +33,7 @@ class Still(Policy):
 
 def test_plans_are_judged_although_there_is_no_prefix(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text(SYSTEM)
-    spec = parse(Source("a.stl", "spec a\nstate signal x\n@safety\nrequire r: always[0,T] x < 0.4\n"))
+    spec = Spec.parse(Source("a.stl", "spec a\nstate signal x\n@safety\nrequire r: always[0,T] x < 0.4\n"))
     task = Task.of(spec, System.load(tmp_path / "a.yaml"))
     x = task.sample(20, seed=3, dtype=torch.float64)
     plan = torch.zeros(20, 1, 1, dtype=torch.float64)

@@ -11,7 +11,7 @@ from stlc.controller.problem.task import Task
 from stlc.diagnostics import UsageError
 from stlc.dynamics.system import System
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 ROOT = Path(__file__).parents[3]
@@ -69,7 +69,7 @@ DRIFT = (
 
 def drift(folder: Path, more: str) -> Task:
     (folder / "drift.yaml").write_text(DRIFT + more)
-    return Task.of(parse(Source("r.stl", RULE)), System.load(folder / "drift.yaml"))
+    return Task.of(Spec.parse(Source("r.stl", RULE)), System.load(folder / "drift.yaml"))
 
 
 def test_the_declared_reward_is_that_of_the_state_after_each_step(tmp_path: Path) -> None:
@@ -123,7 +123,7 @@ def test_rewards_of_the_paper(name: str, state: dict[str, float], reward: float)
 
 def of_benchmark(name: str) -> Task:
     path = ROOT / "specs" / f"{name}.stl"
-    spec = parse(File(path).read())
+    spec = Spec.parse(File(path).read())
     assert spec.system is not None
     return Task.of(spec, System.load(File(spec.system).system(path)))
 
@@ -154,7 +154,7 @@ def test_steps_in_c_are_those_of_torch(name: str, monkeypatch: pytest.MonkeyPatc
 def test_a_mission_observes_its_timers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "drift.yaml").write_text(DRIFT + "policy: {observe: [2 * x]}\n")
     rule = "state signal x [m]\nrequire r: eventually@[0 s, 1 s] x > 0.7 m\n"
-    task = Task.of(parse(Source("r.stl", rule)), System.load(tmp_path / "drift.yaml"))
+    task = Task.of(Spec.parse(Source("r.stl", rule)), System.load(tmp_path / "drift.yaml"))
     made = [Environments(task, 3, generator=torch.Generator())]
     assert made[0]._native is not None
     monkeypatch.setattr(NativeStep, "of", lambda *_, **__: None)

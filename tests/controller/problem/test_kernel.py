@@ -11,7 +11,7 @@ from stlc import native
 from stlc.controller.problem.native import NativeJudge
 from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
@@ -71,7 +71,7 @@ flow: {x: a, y: log(y)}
 init: {mixture: [{draw: {x: 0, y: 1, still: 0}}]}
 """)
     text = "spec a\nstate signal x\nrequire r: always[0,T] x < 2\n"
-    task = Task.of(parse(Source("a.stl", text)), System.load(there))
+    task = Task.of(Spec.parse(Source("a.stl", text)), System.load(there))
     x0 = torch.tensor([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 1.0, torch.nan]], dtype=torch.float64)
     for judged in _both(task, x0, torch.zeros(3, 5, 1, dtype=torch.float64), monkeypatch):
         assert torch.isneginf(judged.rho).tolist() == [False, True, False]

@@ -17,7 +17,7 @@ from stlc.controller.problem.task import Task
 from stlc.diagnostics import SpecError
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
@@ -41,13 +41,13 @@ def _tasks(count: int, rules: int, *, smooth: bool) -> list[Task]:
     for number, text in enumerate(texts):
         system = System(parse_system(Source(str(EXAMPLES / "drawn.yaml"), text), EXAMPLES / "drawn.yaml", {}))
         lines = [line for line in drawn[number::count] if _trains(line, system)][:rules]
-        tasks.append(Task.of(parse(Source("drawn.stl", spec_of(lines))), system))
+        tasks.append(Task.of(Spec.parse(Source("drawn.stl", spec_of(lines))), system))
     return tasks
 
 
 def _trains(line: str, system: System) -> bool:
     try:
-        Task.of(parse(Source("drawn.stl", spec_of([line]))), system)
+        Task.of(Spec.parse(Source("drawn.stl", spec_of([line]))), system)
     except SpecError:
         return False
     return True

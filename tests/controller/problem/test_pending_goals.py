@@ -16,7 +16,7 @@ from stlc.controller.problem.pending_goals import PendingGoals
 from stlc.controller.problem.task import GOALS, Task
 from stlc.dynamics.model.cost import PlanCost
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 LINE = """
@@ -43,7 +43,7 @@ require either: eventually@[0 s, 1 s] x > 3 m or eventually@[0 s, 1 s] x < -3 m
 def task(tmp_path: Path) -> Task:
     path = tmp_path / "line.yaml"
     path.write_text(LINE)
-    return Task.of(parse(Source("line.stl", SPEC)), System.load(path))
+    return Task.of(Spec.parse(Source("line.stl", SPEC)), System.load(path))
 
 
 def columns(task: Task, x: list[float], clock: int = 0, there: float = 0.0) -> dict[str, Tensor]:
@@ -139,7 +139,9 @@ def test_a_guard_carries_on_with_a_plan_that_keeps_a_promise(task: Task) -> None
 def test_without_a_mission_there_are_no_promises(tmp_path: Path) -> None:
     path = tmp_path / "line.yaml"
     path.write_text(LINE)
-    spec = parse(Source("line.stl", "spec line\nstate signal x [m]\nrequire low: always[0, T] x < 3 m\n"))
+    spec = Spec.parse(
+        Source("line.stl", "spec line\nstate signal x [m]\nrequire low: always[0, T] x < 3 m\n")
+    )
     task = Task.of(spec, System.load(path))
     assert isinstance(task.pending_goals, PendingGoals)
     assert task.pending_goals.items == ()

@@ -20,7 +20,7 @@ from stlc.controller.search.planner import PlanBudget, plan, planner_named
 from stlc.controller.search.planner_policy import FIRST, PlannerPolicy
 from stlc.controller.world import ModelWorld
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 CART = """
@@ -53,7 +53,7 @@ require back: always@[11 s, 12 s] (x > -1 m and x < 1 m)
 def task_of(folder: Path, time: str = "", text: str = ERRAND) -> Task:
     path = folder / "cart.yaml"
     path.write_text(CART % time)
-    return Task.of(parse(Source("errand.stl", text)), System.load(path), whole=True)
+    return Task.of(Spec.parse(Source("errand.stl", text)), System.load(path), whole=True)
 
 
 @pytest.fixture
@@ -104,7 +104,7 @@ def test_a_plan_is_asked_for_nothing_after_the_end(task: Task) -> None:
 
 def test_a_mission_no_longer_than_a_plan_needs_no_deadline_to_end(tmp_path: Path) -> None:
     text = "state signal x\nrequire a: eventually[0, 1 s] x > 0.5 m\nrequire b: eventually[0, T] x < -0.5 m\n"
-    spec, path = parse(Source("short.stl", text)), tmp_path / "cart.yaml"
+    spec, path = Spec.parse(Source("short.stl", text)), tmp_path / "cart.yaml"
     for steps, end in (("2 s", 10), ("12 s", None)):
         path.write_text((CART % "").replace("steps: 12 s", f"steps: {steps}"))
         task = Task.of(spec, System.load(path), whole=True)

@@ -15,7 +15,7 @@ from stlc.controller.search import ascent
 from stlc.controller.search.ascent import APART, KEPT, GradientAscent
 from stlc.dynamics.system import System
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from tests.controller.guard.test_prefix_shooting import F64, failing
 
 ROOT = Path(__file__).parents[3]
@@ -39,7 +39,7 @@ def worth(task: Task, x: Tensor, plans: Tensor) -> Tensor:
 @pytest.fixture(scope="module")
 def rover_task() -> Task:
     """One of the controls is a direction, which turns round."""
-    spec = parse(File(ROOT / "specs" / "navigation.stl").read())
+    spec = Spec.parse(File(ROOT / "specs" / "navigation.stl").read())
     return Task.of(spec, System.load(ROOT / "examples" / "rover.yaml"))
 
 

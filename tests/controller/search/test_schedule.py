@@ -10,7 +10,6 @@ import torch
 
 import stlc
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.normal_form import terms
 from stlc.controller.problem.task import Task
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.controller.search.schedules import GoalScheduler, tempo
@@ -62,7 +61,7 @@ def holds(node: ir.Formula, scheduler: GoalScheduler, signals: dict[str, np.ndar
     """Truth by the definition of the operators, with windows cut at the last sample."""
     last = scheduler.steps
     if scheduler.decidable(node):
-        return all(signals[f"c{scheduler.number(part)}"][k] > 0 for part in terms(node, "and"))
+        return all(signals[f"c{scheduler.number(part)}"][k] > 0 for part in node.terms("and"))
     if isinstance(node, ir.BoolOp):
         both = all if node.op == "and" else any
         return both(holds(item, scheduler, signals, k) for item in node.items)

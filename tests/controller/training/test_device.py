@@ -18,7 +18,7 @@ from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import Trainer
 from stlc.dynamics.system import System
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[3]
@@ -63,7 +63,7 @@ def _trained(trainer: Trainer) -> list[float]:
     ],
 )
 def test_training_elsewhere_gives_the_same(spec: str, system: str, tmp_path: Path) -> None:
-    text = parse(File(ROOT / "specs" / f"{spec}.stl").read())
+    text = Spec.parse(File(ROOT / "specs" / f"{spec}.stl").read())
     task = Task.of(text, System.load(ROOT / "examples" / f"{system}.yaml"))
     here = _trained(_trainer(task, CPU))
     folder = RunDir.create(tmp_path, "far")

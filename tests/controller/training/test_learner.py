@@ -14,7 +14,7 @@ from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import EFFORTS, Trainer
 from stlc.controller.training.method import Validation
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 SYSTEM = """
@@ -48,7 +48,7 @@ require dry:  always[0, T] p not in wall
 def puzzle(tmp_path_factory: pytest.TempPathFactory) -> Task:
     path = tmp_path_factory.mktemp("puzzle") / "point.yaml"
     path.write_text(SYSTEM)
-    return Task.of(parse(Source("puzzle.stl", SPEC)), System.load(path))
+    return Task.of(Spec.parse(Source("puzzle.stl", SPEC)), System.load(path))
 
 
 def test_the_planner_solves_a_puzzle_that_local_search_does_not_solve(puzzle: Task) -> None:

@@ -17,7 +17,7 @@ from stlc.controller.training.learner import STEEPEST, Trainer, _bounded_slopes,
 from stlc.controller.training.mission_plans import mission_plans
 from stlc.controller.training.samplers import POOL, Missions
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.rundir import RunDir
 from stlc.source import Source
 
@@ -48,7 +48,7 @@ require inside: always[0, T] x < 7 m
 @pytest.fixture
 def task(tmp_path: Path) -> Task:
     (tmp_path / "line.yaml").write_text(LINE)
-    return Task.of(parse(Source("way.stl", WAY)), System.load(tmp_path / "line.yaml"), whole=True)
+    return Task.of(Spec.parse(Source("way.stl", WAY)), System.load(tmp_path / "line.yaml"), whole=True)
 
 
 def trainer(task: Task) -> Trainer:

@@ -23,7 +23,7 @@ from stlc.controller.training.loop import Watch, resume, train
 from stlc.diagnostics import MissingError, RunError
 from stlc.dynamics.system import System
 from stlc.files import File
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[3]
@@ -56,7 +56,7 @@ def test_a_fixed_training_set(car_task: Task) -> None:
 
 def test_the_system_file_may_ask_for_a_training_set() -> None:
     system = System.load(ROOT / "examples" / "car.yaml", {"train.samples": "500"})
-    task = Task.of(parse(File(ROOT / "specs" / "traffic.stl").read()), system)
+    task = Task.of(Spec.parse(File(ROOT / "specs" / "traffic.stl").read()), system)
     assert resolve_config(task, TrainConfig(method="gradient")).samples == 500
     assert resolve_config(task, TrainConfig(method="guided")).samples == 0
 
@@ -114,7 +114,7 @@ def test_a_resumed_run_has_the_threads_it_was_started_with(
 
 
 def test_the_system_file_chooses_the_method_unless_told() -> None:
-    spec = parse(File(ROOT / "specs/traffic.stl").read())
+    spec = Spec.parse(File(ROOT / "specs/traffic.stl").read())
     system = System.load(ROOT / "examples/car.yaml", {"train.method": "gradient"})
     task = Task.of(spec, system)
     assert resolve_config(task, TrainConfig()).method == "gradient"

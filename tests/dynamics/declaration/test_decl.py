@@ -8,7 +8,7 @@ from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import SpecError
 from stlc.dynamics.load import load_system_decl
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 SYSTEM = """
@@ -44,7 +44,7 @@ def _decl(tmp_path):
 def test_names_that_no_requirement_can_use_are_explained(decl, text, code, advice):
     with pytest.raises(SpecError) as caught:
         compile_spec(
-            parse(Source("s.stl", text)), grid=Grid(decl.dt, decl.horizon), interface=decl.interface()
+            Spec.parse(Source("s.stl", text)), grid=Grid(decl.dt, decl.horizon), interface=decl.interface()
         )
     (finding,) = caught.value.diagnostics
     assert finding.code == code

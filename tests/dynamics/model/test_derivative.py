@@ -13,14 +13,14 @@ from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.dynamics.model.derivative import derivative
-from stlc.dynamics.system import HARD, System
+from stlc.dynamics.system import System
 
 Make = Callable[..., System]
 X, Y = ir.Signal("x"), ir.Signal("y")
 
 
 def value(num: ir.Num, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-    found = ArrayProgram({"out": num})({"x": x, "y": y}, TORCH, HARD)["out"]
+    found = ArrayProgram({"out": num})({"x": x, "y": y}, TORCH)["out"]
     return torch.as_tensor(found, dtype=x.dtype).expand_as(x)
 
 

@@ -24,7 +24,7 @@ from stlc.dynamics.model.feedback import growth_of, linearised, riccati, unstabl
 from stlc.dynamics.scenario import truth, under
 from stlc.dynamics.system import System
 from stlc.export.write import export
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.native import compiler
 from stlc.runtime import Controller
 from stlc.source import Source
@@ -221,7 +221,9 @@ def test_reset_maps_read_what_actuators_get(make: Make) -> None:
 def test_wrong_actuators_are_wrong_of_what_they_get(make: Make) -> None:
     decl = under(one(make).decl, "wrong")
     system = System(decl)
-    task = Task.of(parse(Source("s.stl", "require r: always[0, T] x < 5 m\nstate signal x [m]\n")), system)
+    task = Task.of(
+        Spec.parse(Source("s.stl", "require r: always[0, T] x < 5 m\nstate signal x [m]\n")), system
+    )
     worlds = Worlds(task, world_type(decl), Setting((0,), 6, 5))
     x = 0.2 * worlds.reset()  # where nothing saturates
     plan = torch.full((6, 1), 0.5, dtype=F64)

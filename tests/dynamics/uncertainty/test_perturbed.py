@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from stlc.compile.ir.support import columns_in
 from stlc.diagnostics import SystemFileError, UsageError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.perturbable import perturbable
@@ -177,7 +176,7 @@ def test_numbers_of_tables_held_values_and_delays_are_uncertain() -> None:
     loose = perturbable(room())
     assert [each.text for each in loose.numbers] == ["cold", "gain", "more", "none", "1.5", "3", "7", "0.2 s"]
     assert loose.exact == ("wall",)
-    assert [each.name for each in loose.started if "?cold" in columns_in(each.value)] == ["sum"]
+    assert [each.name for each in loose.started if "?cold" in each.value.columns] == ["sum"]
 
 
 def test_constants_that_are_computed_from_an_uncertain_one_change_with_it() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stlc.diagnostics import CODES, FACTS
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.monitor.facts.findings import findings_on
 from stlc.monitor.facts.rules import RULES
 from stlc.monitor.verdict import Monitor
@@ -182,7 +182,7 @@ def test_a_signal_that_was_seen_for_a_part_of_the_time(tmp_path: Path) -> None:
 
 def test_findings_for_linters_and_editors(tmp_path: Path) -> None:
     path = write(tmp_path / "l.csv", "t,gap", T, RAMP)
-    spec = parse(Source("s.stl", "signal gap [m]\nrequire r: gap < 3 m"))
+    spec = Spec.parse(Source("s.stl", "signal gap [m]\nrequire r: gap < 3 m"))
     (finding,) = findings_on(spec, path)
     assert (finding.code, finding.severity) == ("W711", "fact")
     assert finding.message == "`r`: judged at 0 s only, of 3.9 s"

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from stlc import native
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.lower import lower
 from stlc.compile.ir.simplify import simplify
 from stlc.compile.pipeline import Compiled
 from stlc.compile.semantics.tolerance import TOLERANCE
@@ -109,7 +108,7 @@ def check_stream(formula: ir.Formula, trace: dict[str, np.ndarray], how: How) ->
     share=st.sampled_from([0.0, 0.0, 0.15]),
 )
 def test_a_stream_gives_what_the_whole_trace_gives(written, trace, end, tolerance, share) -> None:
-    formula = simplify(lower(written, random_formulas.GRID, []))
+    formula = simplify(random_formulas.GRID.lower(written, []))
     at = None if random_formulas.a_rule(formula).uses_end else "all"
     check_stream(formula, holed(trace, 0, share), How(at, end, tolerance))
 
@@ -117,7 +116,7 @@ def test_a_stream_gives_what_the_whole_trace_gives(written, trace, end, toleranc
 @settings(max_examples=EXAMPLES // 2, deadline=None)
 @given(written=random_formulas.formulas(held=()), trace=random_formulas.traces(1, 14, 1))
 def test_frozen_values_and_other_samples_give_what_the_whole_trace_gives(written, trace) -> None:
-    formula = simplify(lower(written, random_formulas.GRID, []))
+    formula = simplify(random_formulas.GRID.lower(written, []))
     at = None if random_formulas.a_rule(formula).uses_end else "all"
     check_stream(formula, trace, How(at))
 
@@ -125,7 +124,7 @@ def test_frozen_values_and_other_samples_give_what_the_whole_trace_gives(written
 @settings(max_examples=EXAMPLES // 2, deadline=None)
 @given(random_formulas.formulas(), random_formulas.traces(1, 14, 1), st.sampled_from(["open", "truncate"]))
 def test_without_a_compiler_a_stream_is_evaluated_anew(written, trace, end) -> None:
-    formula = simplify(lower(written, random_formulas.GRID, []))
+    formula = simplify(random_formulas.GRID.lower(written, []))
     at = None if random_formulas.a_rule(formula).uses_end else "all"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(native, "load", lambda _: None)

@@ -32,14 +32,12 @@ def evidence_of(path: Path, question: Question, words: Mapping[str, Sequence[str
 
 def _inputs(question: Question) -> list[Path]:
     """The specification, the files that it imports, and the system; those that exist as files."""
-    from stlc.compile.frontend.modules import imported_files
-
     if question.spec is None:  # the trace holds it, with its imports
         named, files, near = question.system, [], None
     else:
         near = File(question.spec).spec()
         spec = monitor_of(File(near).read(), question).spec
-        named, files = question.system or spec.system, [near, *imported_files(spec)]
+        named, files = question.system or spec.system, [near, *spec.imported_files()]
     with suppress(StlcError):
         files += [] if named is None else [File(named).system(near)]
     return [each for each in dict.fromkeys(files) if each.is_file()]

@@ -169,13 +169,11 @@ def _gap_texts(verdict: Verdict) -> dict[str, str]:
 
 def inconclusive(row: RequirementVerdict, verdict: Verdict | None) -> str:
     """Sentence on why a requirement is inconclusive."""
-    from stlc.compile.ir.support import columns_in
-
     assert verdict is not None
     name, part, dt = visible(row.name), row.part, verdict.about.dt or 0.0
     last = row.start - part.first + row.instants - 1 + row.rule.reach
     needed, length = last * dt, (part.stop - part.first - 1) * dt
-    gaps = [text for signal, text in _gap_texts(verdict).items() if signal in columns_in(row.rule.formula)]
+    gaps = [text for signal, text in _gap_texts(verdict).items() if signal in row.rule.formula.columns]
     if gaps and needed <= length:
         return f"{name} is inconclusive: {', '.join(gaps)}."
     if needed > length:

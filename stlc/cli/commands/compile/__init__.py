@@ -88,12 +88,12 @@ def _trees(names: Sequence[str], show: Literal["ast", "dot"]) -> Answer[ParsedFi
     for Graphviz. The syntax errors of all files are raised together.
     """
     from stlc.cli.commands.compile.tree_text import as_dot, as_tree, as_values
-    from stlc.grammar.parser import parse
+    from stlc.grammar.spec import Spec
 
     specs, findings = [], list[Diagnostic]()
     for name in names:
         try:
-            specs.append(parse(File(name).read()))
+            specs.append(Spec.parse(File(name).read()))
         except SpecError as error:
             findings += error.diagnostics
     if findings:
@@ -107,11 +107,11 @@ def _trees(names: Sequence[str], show: Literal["ast", "dot"]) -> Answer[ParsedFi
 
 def _files(spec: Path, system: str | None) -> list[str]:
     """Files to watch: the specification, and the system file if there is one."""
-    from stlc.grammar.parser import parse
+    from stlc.grammar.spec import Spec
 
     spec = File(spec).spec()
     try:
-        wanted = system or parse(File(spec).read()).system
+        wanted = system or Spec.parse(File(spec).read()).system
         return [str(spec), *([str(File(wanted).system(spec))] if wanted else [])]
     except StlcError:
         return [str(spec)]
@@ -133,10 +133,10 @@ def _compiled(
     from stlc.compile.ir.discretize import Grid
     from stlc.compile.pipeline import Purpose, compile_spec
     from stlc.dynamics.load import load_system_decl
-    from stlc.grammar.parser import parse
+    from stlc.grammar.spec import Spec
 
     path = File(path).spec()
-    spec = parse(File(path).read())
+    spec = Spec.parse(File(path).read())
     wanted = system or spec.system
     if wanted is None:
         help_ = (f"stlc compile {path} --system FILE", 'or a line `system "FILE"` in the specification')

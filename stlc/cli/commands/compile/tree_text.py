@@ -10,21 +10,21 @@ from typing import Any
 
 from stlc.escape import visible
 from stlc.grammar import ast
-from stlc.grammar.traverse import children
+from stlc.grammar.spec import Spec
 from stlc.jsontext import dumps
 
 _HIDDEN = frozenset({"span", "name_span", "system_span", "source", "quoted"})
 _ODD = re.compile(r"[\s\"\\=]")
 
 
-def as_tree(spec: ast.Spec) -> str:
+def as_tree(spec: Spec) -> str:
     """Text with one line per node of a syntax tree; children are indented below their parent."""
     lines: list[str] = []
     stack: list[tuple[int, ast.Node]] = [(0, spec)]
     while stack:
         depth, node = stack.pop()
         lines.append("  " * depth + " ".join([type(node).__name__, *_facts(node)]))
-        stack.extend((depth + 1, child) for child in reversed(list(children(node))))
+        stack.extend((depth + 1, child) for child in reversed(list(node.children())))
     return "\n".join(lines)
 
 
@@ -89,7 +89,7 @@ def _value(value: object) -> Any:
             return value
 
 
-def as_dot(specs: Sequence[ast.Spec]) -> str:
+def as_dot(specs: Sequence[Spec]) -> str:
     """Text of a directed graph for Graphviz, in which every node of the trees is a node."""
     lines = ["digraph stlc {", '  node [shape=box, fontname="monospace"];']
     count = 0
@@ -101,7 +101,7 @@ def as_dot(specs: Sequence[ast.Spec]) -> str:
         if parent is not None:
             lines.append(f"  n{parent} -> n{count};")
         own, count = count, count + 1
-        stack.extend((own, child) for child in reversed(list(children(node))))
+        stack.extend((own, child) for child in reversed(list(node.children())))
     return "\n".join([*lines, "}"])
 
 

@@ -16,7 +16,6 @@ from rich.text import Text
 
 from stlc.cli.commands.check.text import percent, signed
 from stlc.cli.framework.output import table
-from stlc.compile.ir.traverse import margin_unit
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import SOURCES
 
@@ -145,7 +144,7 @@ class LiveView:
         In a narrow terminal, the bars are shortened first; names are cut only after that.
         """
         margins = self.monitor.margins
-        units = {rule.name: margin_unit(rule.typed.formula) for rule in self.monitor.task.rules}
+        units = {rule.name: rule.typed.formula.margin_unit for rule in self.monitor.task.rules}
         texts = {name: self._texts(margin, units.get(name, "")) for name, margin in margins.items()}
         wide = [max(len(parts[k]) for parts in texts.values()) for k in range(3)]
         label = max(map(len, margins))

@@ -15,12 +15,12 @@ from dataclasses import dataclass
 from functools import partial, reduce
 from typing import Any, TypeAlias
 
+from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.array.tape import GradientTape, Instr, Operand
 from stlc.compile.backends.numbers import Leaf, NumberEvaluator
 from stlc.compile.backends.schedule import IndexRange
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
-from stlc.compile.ir.traverse import key_of, leaves
 from stlc.compile.namespace import Array, Ops
 from stlc.compile.semantics.switch import Hard, Switch
 
@@ -68,12 +68,14 @@ class ArrayProgram:
         tape, _ = self._tape(exact=True)
         self.columns = frozenset(str(i.params[0]) for i in tape.code if i.kernel == "input")
         shifted = (
-            leaf for num in outputs.values() for leaf in leaves(num) if isinstance(leaf, ir.ShiftedSignal)
+            leaf for num in outputs.values() for leaf in num.leaves() if isinstance(leaf, ir.ShiftedSignal)
         )
-        self.shifted = {key_of(leaf): leaf for leaf in shifted}
+        self.shifted = {_key_of(leaf): leaf for leaf in shifted}
         self.plain = not self.shifted and ir.ELAPSED not in self.columns
 
-    def __call__(self, env: Mapping[str, Array], ops: Ops, switch: Switch | None = None) -> dict[str, Array]:
+    def __call__(
+        self, env: Mapping[str, Array], ops: Ops = NUMPY, switch: Switch | None = None
+    ) -> dict[str, Array]:
         """Return the value of each output, by name, computed from the arrays `env`.
 
         `switch` converts a condition to a number from 0 (false) to 1 (true). If `switch` is None, the number
@@ -254,7 +256,7 @@ class _TapeWriter(NumberEvaluator[Operand]):
             known = self.bound.get(num.name, self._constants.get(num.name))
             if known is not None:
                 return known
-        return self.tape.emit("input", params=(key_of(num),))
+        return self.tape.emit("input", params=(_key_of(num),))
 
     def _function(self, name: str, args: list[Operand]) -> Operand:
         function = FUNCTIONS[name]
@@ -384,3 +386,13 @@ def _shifted_rows(column: Array, at: ir.ShiftedSignal, run: IndexRange, ops: Ops
         return _rows(column, start, count)
     inside = [column[max(start, 0) : min(start + count, samples)]] if before + after < count else []
     return ops.cat([*[column[:1]] * before, *inside, *[column[-1:]] * after])
+
+
+def _key_of(leaf: ir.Signal | ir.ShiftedSignal | ir.FrozenVar) -> str:
+    """Return the name of the input of a compiled program that provides a signal or a frozen value.
+
+    A shifted signal is an input of its own; the name of this input contains the number of steps.
+    """
+    if isinstance(leaf, ir.ShiftedSignal):
+        return f"{leaf.name}\0{leaf.steps}{'!' * leaf.clamped}"
+    return leaf.name

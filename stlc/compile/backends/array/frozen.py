@@ -19,8 +19,7 @@ import numpy as np
 from stlc.compile.backends.array.arith import ArrayProgram, inputs
 from stlc.compile.backends.schedule import IndexRange, TraceDomain, reads, spanning, within
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import Reach, columns_in, depends_on_ends, reach, uses_end
-from stlc.compile.ir.traverse import frozen_in, map_children, nodes, numbers
+from stlc.compile.ir.support import Reach
 from stlc.compile.namespace import Array, Ops
 
 Env: TypeAlias = Mapping[str, Array]
@@ -155,7 +154,7 @@ class Freezer:
         that the shape is known.
         """
         own = {name for name, _ in node.bindings}
-        names = set(columns_in(node.body)).union(*map(frozen_in, numbers(node.body))) - own
+        names = set(node.body.columns).union(*(each.frozen for each in node.body.numbers())) - own
         return {name: self.env[name] for name in names & self.env.keys() or list(self.env)[:1]}
 
     @property
@@ -172,12 +171,12 @@ def _neighbourhood(body: ir.Formula) -> tuple[float, float]:
 
     A number is inf if all samples on that side of the instant may be read.
     """
-    past, future = reach(body)
-    on_clock = any(isinstance(node, ir.AtStart) for node in nodes(body))
-    if on_clock or any(map(depends_on_ends, numbers(body))):
+    past, future = body.reach
+    on_clock = any(isinstance(node, ir.AtStart) for node in body.walk())
+    if on_clock or any(each.depends_on_ends for each in body.numbers()):
         return math.inf, math.inf
-    back = any(isinstance(node, ir.Windowed) and node.back and node.window.hi is None for node in nodes(body))
-    return math.inf if back else past, math.inf if uses_end(body) else future
+    back = any(isinstance(node, ir.Windowed) and node.back and node.window.hi is None for node in body.walk())
+    return math.inf if back else past, math.inf if body.uses_end else future
 
 
 def _chunk_size(most: int, width: float, samples: int) -> int:
@@ -205,13 +204,13 @@ def without(body: ir.Formula, names: frozenset[str], domain: TraceDomain) -> ir.
     """
     match body:
         case ir.Predicate(num, sign):
-            if not frozen_in(num) & names:
+            if not num.frozen & names:
                 return body
             return ir.Truth(domain.end == "upper" if domain.open else sign < 0, body.span)
         case ir.Freeze(bindings, inner):
-            lost = {name for name, num in bindings if frozen_in(num) & names}
+            lost = {name for name, num in bindings if num.frozen & names}
             inner = without(inner, names - {name for name, _ in bindings} | lost, domain)
             kept = tuple((name, num) for name, num in bindings if name not in lost)
             return replace(body, bindings=kept, body=inner) if kept else inner
         case _:
-            return map_children(body, formulas=lambda part: without(part, names, domain))
+            return body.map_children(formulas=lambda part: without(part, names, domain))

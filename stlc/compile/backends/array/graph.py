@@ -31,7 +31,7 @@ def evaluate(
     formulas: Sequence[ir.Formula],
     env: Mapping[str, Array],
     *,
-    ops: Ops,
+    ops: Ops = NUMPY,
     semantics: Semantics | None = None,
     start: int = 0,
     count: int = 1,
@@ -136,7 +136,7 @@ def robustness_signal(
     formula: ir.Formula,
     env: Mapping[str, Array],
     *,
-    ops: Ops,
+    ops: Ops = NUMPY,
     semantics: Semantics | None = None,
     end: Boundary = "strict",
 ) -> Array:

@@ -154,7 +154,7 @@ def _batches(
             if inside.count > 0 and isinstance(step.node.num, ir.Signal) and step.node.sign > 0:
                 predicates[index] = StepSource(None, step.node.num.name, inside)
             elif inside.count > 0:
-                margin = step.node.num if step.node.sign > 0 else ir.Op("neg", (step.node.num,))
+                margin = step.node.num if step.node.sign > 0 else -step.node.num
                 wanted.setdefault(margin, []).append((inside, index))
     grouped: dict[IndexRange, dict[ir.Num, list[tuple[IndexRange, int]]]] = {}
     for num, ranges in wanted.items():

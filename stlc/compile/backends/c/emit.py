@@ -17,7 +17,6 @@ from stlc.compile.backends.c.printer import StepPrinter
 from stlc.compile.backends.numbers import Leaf
 from stlc.compile.backends.schedule import End
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import leaves
 from stlc.compile.semantics.tolerance import TOLERANCE
 
 LANES = 16
@@ -97,7 +96,7 @@ def emit(motion: Motion, formulas: Sequence[ir.Formula], end: End = "strict") ->
     """
     plan = plan_of(formulas, motion.steps + 1, end)
     states, rules, steps = len(motion.states), len(formulas), motion.steps
-    read = {leaf.name for formula in formulas for leaf in leaves(formula) if not isinstance(leaf, ir.Const)}
+    read = {leaf.name for formula in formulas for leaf in formula.leaves() if not isinstance(leaf, ir.Const)}
     moving = ", ".join(str(int(name in motion.next)) for name in motion.states)
     return "\n".join(
         [

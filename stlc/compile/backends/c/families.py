@@ -12,7 +12,6 @@ from typing import Any, TypeAlias, TypeVar
 
 from stlc.compile.backends.c.numbers import LISTED
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import map_children
 
 LEAST = 8
 """Minimum number of members of a family."""
@@ -135,4 +134,5 @@ def _changed(node: N, change: Callable[[Entry], ir.Num]) -> N:
 
     if isinstance(node, ir.Op) and node.name == "pow":  # compilers round some constant exponents differently
         return replace(node, args=(below(node.args[0]), node.args[1]))
-    return map_children(node, formulas=below, numbers=below)
+    found: N = node.map_children(formulas=below, numbers=below)
+    return found

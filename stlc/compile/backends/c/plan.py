@@ -31,8 +31,6 @@ from stlc.compile.backends.schedule import (
     latest,
 )
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import columns_in, reach_of
-from stlc.compile.ir.traverse import frozen_in, operands, subexpressions
 from stlc.compile.namespace import Pick
 
 CallKey: TypeAlias = tuple[str, tuple[ir.Signal, ...]]
@@ -334,10 +332,10 @@ class _Planner(Scheduler):
         Raises:
             Untranslatable: the expression needs samples outside of the trajectory.
         """
-        past, future = reach_of(num)
+        past, future = num.reach
         if earliest(run.start) < past or latest(run.last) + future >= self.domain.samples:
             raise Untranslatable("a sample outside of the plan")
-        for part in subexpressions(num):
+        for part in num.subexpressions():
             key = call_of(part)
             if key is not None and key not in self.calls:
                 self._call(key, part)
@@ -372,12 +370,12 @@ def _frozen_names(formula: ir.Formula) -> frozenset[str]:
     """
     match formula:
         case ir.Predicate(num):
-            return frozen_in(num) | columns_in(num)
+            return num.frozen | num.columns
         case ir.Freeze(bindings, body):
             inner = _frozen_names(body) - {name for name, _ in bindings}
-            return inner.union(*(frozen_in(num) | columns_in(num) for _, num in bindings))
+            return inner.union(*(num.frozen | num.columns for _, num in bindings))
         case _:
-            return frozenset().union(*map(_frozen_names, operands(formula)))
+            return frozenset().union(*map(_frozen_names, formula.operands))
 
 
 LARGE = 64
@@ -391,7 +389,7 @@ def _split(formula: ir.Formula) -> ir.Formula:
     """
     if not isinstance(formula, ir.Predicate) or formula.guard or not isinstance(formula.num, ir.Op):
         return formula
-    if next(islice(subexpressions(formula.num), LARGE, None), None) is None:
+    if next(islice(formula.num.subexpressions(), LARGE, None), None) is None:
         return formula
     num = _distributed(formula.num)
     name, args = num.name, num.args

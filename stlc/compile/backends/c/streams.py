@@ -28,8 +28,7 @@ from stlc.compile.backends.numbers import Leaf, Untranslatable
 from stlc.compile.backends.schedule import PICKS
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.holes import unsure
-from stlc.compile.ir.support import farthest, reach_of
-from stlc.compile.ir.traverse import leaves, map_children, operands
+from stlc.compile.ir.support import NOW, Offsets
 
 RUNTIME = Path(__file__).with_name("streams.c")
 
@@ -53,8 +52,8 @@ class Begun(ir.Shift):
     """An unbounded `until` with its part before the window: unknown until a sample of its window exists."""
 
     @property
-    def offsets(self) -> tuple[ir.Offsets, ...]:
-        return (ir.NOW,)
+    def offsets(self) -> tuple[Offsets, ...]:
+        return (NOW,)
 
 
 def normal(formula: ir.Formula) -> ir.Formula:
@@ -68,7 +67,7 @@ def normal(formula: ir.Formula) -> ir.Formula:
             return formula
         case ir.Freeze() | ir.AtStart():
             raise Untranslatable(type(formula).__name__)
-    whole: Any = map_children(formula, formulas=normal)
+    whole: Any = formula.map_children(formulas=normal)
     if not isinstance(whole, ir.Windowed):
         return whole  # type: ignore[no-any-return]
     return _windowed(whole, whole.names[0])
@@ -161,7 +160,7 @@ def _reads(form: ir.Formula) -> tuple[int, int]:
     """Least and greatest instant, relative to now, at which a node reads its operands or signals."""
     match form:
         case ir.Predicate(num):
-            reach = farthest(num)
+            reach = num.farthest
             return -reach.past if reach.past < 1 << 29 else 0, reach.future
         case ir.Temporal(window=window):
             return window.lo, window.hi or 0
@@ -217,7 +216,7 @@ class Graph:
     def _place(self, form: ir.Formula) -> int:
         if form in self._known:
             return self._known[form]
-        parts = operands(form)
+        parts = form.operands
         if isinstance(form, (ir.Until, ir.Since)) and parts[0] == ir.Truth(PICKS[form.op] == "max"):
             parts = parts[1:]
         args = tuple(map(self._place, parts))
@@ -416,7 +415,7 @@ class Graph:
     def _predicate(self, node: Node) -> Lines:
         atom = node.form
         assert isinstance(atom, ir.Predicate)
-        near, far = reach_of(atom.num), farthest(atom.num)
+        near, far = atom.num.reach, atom.num.farthest
 
         def place(leaf: Leaf) -> str | None:
             if isinstance(leaf, ir.Extern):
@@ -432,7 +431,7 @@ class Graph:
                 instant = f"sooner({instant}, x->known - 1)" if steps > 0 else f"later({instant}, 0)"
             return f"X({column}, {instant})"
 
-        reads = {place(leaf) for leaf in leaves(atom.num) if isinstance(leaf, (ir.Signal, ir.ShiftedSignal))}
+        reads = {place(leaf) for leaf in atom.num.leaves() if isinstance(leaf, (ir.Signal, ir.ShiftedSignal))}
         known = (
             " && ".join(f"{text} == {text}" for text in sorted(filter(None, reads)) if text != "(real)t")
             or "1"

@@ -32,7 +32,6 @@ from stlc.compile.backends.schedule import PICKS, End, TraceDomain, earliest, la
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.ir.text import show_number
-from stlc.compile.ir.traverse import leaves, nodes, numbers
 
 MARGIN = 1e-5
 """Margin of the dynamics' conditions in a tight encoding; tolerance of all conditions in a relaxed one."""
@@ -641,7 +640,7 @@ def _read_once(names: set[str], lets: Sequence[tuple[str, ir.Num]], nums: Iterab
     reads = Counter[str]()
 
     def read(num: ir.Num, times: int) -> None:
-        for leaf in leaves(num):
+        for leaf in num.leaves():
             if isinstance(leaf, ir.Signal):
                 reads[leaf.name] += times
 
@@ -654,8 +653,8 @@ def _read_once(names: set[str], lets: Sequence[tuple[str, ir.Num]], nums: Iterab
 
 def _of_state(formula: ir.Formula) -> bool:
     """True if the formula is about the signals at a single sample, without temporal operators."""
-    return all(isinstance(node, ir.Truth | ir.Predicate | ir.BoolOp) for node in nodes(formula)) and not any(
-        isinstance(leaf, ir.ShiftedSignal) for num in numbers(formula) for leaf in leaves(num)
+    return all(isinstance(node, ir.Truth | ir.Predicate | ir.BoolOp) for node in formula.walk()) and not any(
+        isinstance(leaf, ir.ShiftedSignal) for num in formula.numbers() for leaf in num.leaves()
     )
 
 

@@ -18,7 +18,6 @@ from stlc.compile.backends.onnx.graph import BATCH, Attribute, GraphBody, Kind, 
 from stlc.compile.backends.schedule import spanning
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined
-from stlc.compile.ir.traverse import map_children, numbers, subexpressions
 from stlc.compile.namespace import FloatConstants, Ops, Pick, ScanByRows, Sliding
 
 Number: TypeAlias = Value | float
@@ -298,7 +297,7 @@ def build_graph(
     env = dict(columns)
     samples = len(next(iter(env.values())))
     for formula in formulas:
-        require_numbers(numbers(formula))
+        require_numbers(formula.numbers())
         if not defined(formula, samples)[:count].all():
             raise Untranslatable("a sample outside of the plan")
     substituted = [_without_freeze(formula, env) for formula in formulas]
@@ -309,7 +308,7 @@ def build_graph(
 def require_numbers(nums: Iterable[ir.Num]) -> None:
     """Raise Untranslatable if an expression calls a function that is known in Python only."""
     for num in nums:
-        for part in subexpressions(num):
+        for part in num.subexpressions():
             if isinstance(part, ir.Extern) and not isinstance(part.function, ir.Body):
                 raise Untranslatable(f"the function `{part.name}`")
 
@@ -320,7 +319,7 @@ def _without_freeze(formula: ir.Formula, env: Columns) -> ir.Formula:
         name = f"#frozen{len(env)}"
         env[name] = _frozen(formula, env)
         return ir.Predicate(ir.Signal(name))
-    return map_children(formula, formulas=lambda part: _without_freeze(part, env))
+    return formula.map_children(formulas=lambda part: _without_freeze(part, env))
 
 
 def _frozen(node: ir.Freeze, env: Columns) -> Value:

@@ -14,10 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.normal_form import joined, rejoined, terms
-from stlc.compile.ir.support import columns_in
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.signature import Column
 
@@ -51,8 +48,8 @@ class Landmarks:
                 if any(all(not self._excludes(part, each) for part in _literals(one)) for each in open_)
             ]
             if gate:
-                before.append(joined("or", gate))
-                rest.append(joined("or", open_))
+                before.append(ir.BoolOp.joined("or", gate))
+                rest.append(ir.BoolOp.joined("or", open_))
                 left = [one for one in left if not any(self._excludes(one, each) for each in gate)]
         if not before:
             return ()
@@ -60,7 +57,8 @@ class Landmarks:
         def open_to(formula: ir.Formula) -> ir.Formula:
             return ir.Truth(False) if any(self._excludes(one, formula) for one in left) else formula
 
-        return joined("and", before), joined("and", (*left, *(rejoined(each, open_to) for each in rest)))
+        left.extend(each.map_terms(open_to) for each in rest)
+        return ir.BoolOp.joined("and", before), ir.BoolOp.joined("and", left)
 
     def _excludes(self, literal: ir.Formula, formula: ir.Formula) -> bool:
         """True if a literal and a conjunction never hold together."""
@@ -70,23 +68,18 @@ class Landmarks:
         key = one, other
         if key not in self._apart:
             self._apart[key] = False
-            read = columns_in(one)
-            column = (
-                self.ranges.get(next(iter(read))) if len(read) == 1 and read == columns_in(other) else None
-            )
+            read = one.columns
+            column = self.ranges.get(next(iter(read))) if len(read) == 1 and read == other.columns else None
             if column is not None and column.low is not None and column.high is not None:
                 env = {column.name: np.linspace(column.low, column.high, VALUES)[None]}
-                held = [
-                    np.broadcast_to(TOLERANCE.satisfied(each[0]), VALUES)
-                    for each in evaluate(key, env, ops=NUMPY)
-                ]
+                held = [np.broadcast_to(TOLERANCE.satisfied(each[0]), VALUES) for each in evaluate(key, env)]
                 self._apart[key] = not bool((held[0] & held[1]).any())
         return self._apart[key]
 
 
 def _literals(formula: ir.Formula) -> Iterator[ir.Formula]:
     """Yield the predicates that hold wherever a formula holds."""
-    for part in terms(formula, "and"):
+    for part in formula.terms("and"):
         if isinstance(part, ir.Temporal) and part.op == "always":
             yield from _literals(part.body)
         elif isinstance(part, ir.Predicate):

@@ -17,13 +17,9 @@ import numpy as np
 
 from stlc.compile.augment.lift import hoist_absolute
 from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.lower import lower
-from stlc.compile.ir.normal_form import joined, normal
+from stlc.compile.ir.normal_form import normal
 from stlc.compile.ir.simplify import simplify
-from stlc.compile.ir.support import columns_in
-from stlc.compile.ir.traverse import map_children, nodes
 from stlc.compile.semantics.tolerance import TOLERANCE
 
 if TYPE_CHECKING:
@@ -47,7 +43,7 @@ class Obligations:
         self._relative = tuple(rule.formula for rule in task.rules if not rule.absolute)
         absolute = [rule for rule in task.rules if rule.absolute]
         grid = task.compiled.grid
-        self._written = [lower(hoist_absolute(normal(rule.typed.formula), []), grid, []) for rule in absolute]
+        self._written = [grid.lower(hoist_absolute(normal(rule.typed.formula), []), []) for rule in absolute]
         parts = [
             part
             for written, rule in zip(self._written, absolute, strict=True)
@@ -69,7 +65,7 @@ class Obligations:
         if not clock:
             return self.first
         env = {name: np.array([[float(value)]]) for name, value in zip(self._names, state, strict=True)}
-        bounds = evaluate(self._progressed, env, ops=NUMPY, end="lower", stop=self._horizon + 1)
+        bounds = evaluate(self._progressed, env, end="lower", stop=self._horizon + 1)
         met = tuple(bool(TOLERANCE.satisfied(np.broadcast_to(bound[0], 1))[0]) for bound in bounds)
         pending = (self._pending(response, env, clock) for response in self._responses)
         return (*self._known(clock, met), *(each for each in pending if each is not None))
@@ -90,10 +86,10 @@ class Obligations:
             if self._clock is not None:
                 whole[self._clock] = np.broadcast_to(clock + samples, shape)
             for name, part in response.parts.items():
-                now = evaluate([ir.Predicate(part.num)], env, ops=NUMPY)[0]
+                now = evaluate([ir.Predicate(part.num)], env)[0]
                 later = np.where(samples < answers, -part.value, part.value) if part.answers else part.value
                 whole[name] = np.where(samples == 0.0, now, later)
-            judged = evaluate([response.form], whole, ops=NUMPY, end="truncate")[0]
+            judged = evaluate([response.form], whole, end="truncate")[0]
             return np.broadcast_to(TOLERANCE.satisfied(judged[0]), len(answers)).astype(np.bool_)
 
         if good(np.array([np.inf]))[0]:
@@ -115,10 +111,9 @@ class Obligations:
         kept = [
             item
             for item in formula.items
-            if columns_in(item) != {self._clock}
-            or bool((evaluate([item], env, ops=NUMPY, count=len(time))[0] >= 0.0).any())
+            if item.columns != {self._clock} or bool((evaluate([item], env, count=len(time))[0] >= 0.0).any())
         ]
-        return joined("or", kept)
+        return ir.BoolOp.joined("or", kept)
 
     def _formulas(self, clock: int, met: tuple[bool, ...]) -> tuple[ir.Formula, ...]:
         """Return the obligations at step `clock`; `met`: the parts of `_progressed` that every plan meets."""
@@ -146,7 +141,7 @@ class Obligations:
             if isinstance(formula, ir.Until):
                 return ir.Temporal("always", ir.Window(0, None), formula.left)
             return ir.Truth(True)
-        return replace(formula, window=ir.Window(lo, last))
+        return formula.with_window(lo, last)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,17 +181,17 @@ def _responses(written: ir.Formula, form: ir.Formula, own: frozenset[str]) -> It
     formula = written.body if isinstance(written, ir.AtStart) else written
     if not (isinstance(formula, ir.Temporal) and formula.op == "always"):
         return
-    asked = [node for node in nodes(formula) if isinstance(node, ir.Predicate) and columns_in(node) & own]
+    asked = [node for node in formula.walk() if isinstance(node, ir.Predicate) and node.columns & own]
     names = {node.num: f"#{i}" for i, node in enumerate(asked)}
 
     def named(node: ir.Formula) -> ir.Formula:
         if isinstance(node, ir.Predicate) and node.num in names:
             return replace(node, num=ir.Signal(names[node.num]))
-        return map_children(node, formulas=named)
+        return node.map_children(formulas=named)
 
-    for goal in nodes(formula.body):
+    for goal in formula.body.walk():
         if isinstance(goal, ir.Temporal) and goal.op == "eventually" and goal.window.hi:
-            inside = {node.num for node in nodes(goal.body) if isinstance(node, ir.Predicate)}
+            inside = {node.num for node in goal.body.walk() if isinstance(node, ir.Predicate)}
             order = sorted(asked, key=lambda node: node.num in inside)
             parts = {names[node.num]: _Part(node.num, float(node.sign), node.num in inside) for node in order}
             yield _Response(goal.body, goal.window.hi, named(form), parts)
@@ -215,5 +210,5 @@ def _is_branch(formula: ir.Formula) -> TypeGuard[ir.BoolOp]:
     """True for an `and` or `or` of formulas of which one looks ahead."""
     return isinstance(formula, ir.BoolOp) and any(
         isinstance(node, ir.AtStart) or (isinstance(node, ir.Windowed) and not node.back)
-        for node in nodes(formula)
+        for node in formula.walk()
     )

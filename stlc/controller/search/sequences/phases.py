@@ -19,14 +19,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.c.emit import LANES, emit
 from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.normal_form import joined
 from stlc.compile.ir.simplify import simplify
-from stlc.compile.ir.support import columns_in
-from stlc.compile.ir.traverse import map_children, nodes
 from stlc.controller.problem.kernel import Kernel, SearchOptions, Sizes
 from stlc.controller.problem.native import motion_of
 from stlc.native import load
@@ -192,28 +188,20 @@ class Phases:
         weights = (WEIGHT.format(i) for i in range(WEIGHTS))
         added = (TARGET, FIRST, LAST, *weights, *(OPEN.format(i) for i in range(len(untils))))
         motion = replace(motion, states=(*motion.states, *added), steps=steps)
-        kept = (
-            ir.BoolOp("or", (_equal(ir.Signal(OPEN.format(i)), 0.0), each)) for i, each in enumerate(untils)
-        )
+        kept = (_equal(ir.Signal(OPEN.format(i)), 0.0) | each for i, each in enumerate(untils))
         shortfall = _Shortfall(scale)
-        held = _decisive(joined("and", (safe, *kept)))
+        held = _decisive(ir.BoolOp.joined("and", (safe, *kept)))
         chosen = (
-            ir.BoolOp("and", (_equal(ir.Signal(TARGET), float(i)), shortfall.of(target)))
-            for i, target in enumerate(targets)
+            _equal(ir.Signal(TARGET), float(i)) & shortfall.of(target) for i, target in enumerate(targets)
         )
         now = ir.Signal(ir.ELAPSED)
         times = _at_least(now, ir.Signal(FIRST)), _at_least(ir.Signal(LAST), now)
         tail = (
             ir.Temporal("always", ir.Window(1, 1), held),
-            ir.BoolOp(
-                "or",
-                (
-                    ir.Temporal("always", ir.Window(1, max(1, steps // TAIL)), held),
-                    ir.Predicate(ir.Const(-UNSURE)),
-                ),
-            ),
+            ir.Temporal("always", ir.Window(1, max(1, steps // TAIL)), held)
+            | ir.Predicate(ir.Const(-UNSURE)),
         )
-        reached = ir.BoolOp("and", (*times, joined("or", chosen), *tail))
+        reached = ir.BoolOp("and", (*times, ir.BoolOp.joined("or", chosen), *tail))
         formula = simplify(ir.Until("until", ir.Window(0, steps), held, reached))
         try:
             library = load(emit(motion, [formula], "truncate"))
@@ -410,7 +398,7 @@ class Phases:
         values = np.stack(
             [
                 np.broadcast_to(each[0], (self.steps + 1) * count * (moves + 1))
-                for each in evaluate(literals, flat, ops=NUMPY)
+                for each in evaluate(literals, flat)
             ]
         )
         values = values.reshape(len(literals), self.steps + 1, count, moves + 1)
@@ -537,7 +525,7 @@ def _demands(formula: ir.Formula, known: frozenset[str], later: int = 0) -> list
     Of an `always`, the first, the middle and the last sample count.
     """
     match formula:
-        case ir.Predicate() if columns_in(formula) <= known:
+        case ir.Predicate() if formula.columns <= known:
             return [(Demand(formula, later, LEAST_MARGIN),)]
         case ir.BoolOp("or", items):
             return [each for item in items for each in _demands(item, known, later)][:OPTIONS]
@@ -597,22 +585,22 @@ class _Shortfall:
         """Return a formula whose robustness is the negative shortfall of `formula`."""
         if isinstance(formula, ir.Truth):
             return formula
-        if not all(isinstance(node, (ir.Truth, ir.Predicate, ir.BoolOp)) for node in nodes(formula)):
-            return map_children(formula, formulas=self.of)
-        return ir.Predicate(ir.Op("neg", (self._shortfall(formula),)))
+        if not all(isinstance(node, (ir.Truth, ir.Predicate, ir.BoolOp)) for node in formula.walk()):
+            return formula.map_children(formulas=self.of)
+        return ir.Predicate(-self._shortfall(formula))
 
     def _shortfall(self, formula: ir.Formula) -> ir.Num:
         match formula:
             case ir.Predicate(num, sign, strict):
-                margin = num if sign > 0 else ir.Op("neg", (num,))
-                tightened = ir.Op("sub", (margin, ir.Const(LEAST_MARGIN))) if strict else margin
+                margin = num if sign > 0 else -num
+                tightened = margin - LEAST_MARGIN if strict else margin
                 share = ir.Const(1.0 / self._scale(formula))
-                group = self._groups.setdefault(columns_in(formula), len(self._groups)) % WEIGHTS
-                weight = ir.Op("mul", (ir.Signal(WEIGHT.format(group)), share))
-                return ir.Op("mul", (ir.Op("relu", (ir.Op("neg", (tightened,)),)), weight))
+                group = self._groups.setdefault(formula.columns, len(self._groups)) % WEIGHTS
+                weight = ir.Signal(WEIGHT.format(group)) * share
+                return (-tightened).apply("relu") * weight
             case ir.BoolOp(op, items):
                 name = "add" if op == "and" else "min"
-                return reduce(lambda a, b: ir.Op(name, (a, b)), map(self._shortfall, items))
+                return reduce(lambda a, b: a.apply(name, b), map(self._shortfall, items))
             case ir.Truth(value):
                 return ir.Const(0.0 if value else 1.0)
             case _:
@@ -623,13 +611,13 @@ def _decisive(formula: ir.Formula) -> ir.Formula:
     """Return the formula with robustness +inf where it holds, and -inf elsewhere."""
     if isinstance(formula, ir.Predicate):
         return replace(formula, guard=True)
-    return map_children(formula, formulas=_decisive)
+    return formula.map_children(formulas=_decisive)
 
 
 def _at_least(left: ir.Num, right: ir.Num) -> ir.Predicate:
-    return ir.Predicate(ir.Op("sub", (left, right)), guard=True)
+    return ir.Predicate(left - right, guard=True)
 
 
 def _equal(left: ir.Num, value: float) -> ir.Predicate:
-    apart = ir.Op("abs", (ir.Op("sub", (left, ir.Const(value))),))
-    return ir.Predicate(ir.Op("sub", (ir.Const(0.5), apart)), guard=True)
+    apart = (left - value).apply("abs")
+    return ir.Predicate(0.5 - apart, guard=True)

@@ -23,12 +23,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 
 from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import substitute
-from stlc.compile.ir.normal_form import joined, negate, rejoined, terms
-from stlc.compile.ir.support import columns_in
-from stlc.compile.ir.traverse import leaves, map_children, nodes, subexpressions
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.search.sequences.phases import levels
 from stlc.controller.search.sequences.residuals import YES, looks_ahead
@@ -131,7 +126,7 @@ class Relaxation:
         while more := {
             name
             for name, value in self._flow.items()
-            if name not in self.driven and columns_in(_settled(value, None)) & self.driven
+            if name not in self.driven and _settled(value, None).columns & self.driven
         }:
             self.driven |= more
         clauses = [clause for formula in safe for clause in clauses_of(formula)]
@@ -174,7 +169,7 @@ class Relaxation:
             for literal in self._literals_of(group.target):
                 if self._sort(literal) == "driven" and literal not in self._ways:
                     self._motions.setdefault(self._number[literal], []).append(len(jumps) + i)
-        reads = [columns_in(literal) for literal in self._literals]
+        reads = [literal.columns for literal in self._literals]
         self._setters = [
             [
                 i
@@ -195,7 +190,7 @@ class Relaxation:
             for assign in step.jump.resets:
                 if isinstance(assign.value, ir.Const):
                     env[assign.name][0, i + 1] = assign.value.value
-                elif columns_in(assign.value) <= env.keys():
+                elif assign.value.columns <= env.keys():
                     growing[i] = True
                     known = {name: column[:, :1] for name, column in env.items()}
                     env[assign.name][0, i + 1] = _values([ir.Predicate(assign.value)], known)[0, 0]
@@ -256,7 +251,7 @@ class Relaxation:
         if len(modes) < len(parts):
             last = math.ceil(samples - PROBE)
             target = ir.Temporal("always", ir.Window(0, last), formula) if last <= LONGEST else formula
-            yield RelaxedStep(joined("and", modes), target, last if last <= LONGEST else 0)
+            yield RelaxedStep(ir.BoolOp.joined("and", modes), target, last if last <= LONGEST else 0)
 
     def _step(
         self, jump: JumpDecl, clauses: Sequence[Sequence[ir.Formula]], orders: Sequence[ir.Until]
@@ -266,36 +261,36 @@ class Relaxation:
         extra = [self._left(clause, fixed) for clause in clauses]
         for order in orders:
             asked = (self._left(clause, fixed) for clause in clauses_of(order.left))
-            extra.append(joined("or", (joined("and", asked), present(order.right))))
-        condition = joined("and", (jump.guard, *extra))
+            extra.append(ir.BoolOp.joined("or", (ir.BoolOp.joined("and", asked), present(order.right))))
+        condition = ir.BoolOp.joined("and", (jump.guard, *extra))
         controls = frozenset(self._controls)
-        if not columns_in(jump.guard) & controls:
+        if not jump.guard.columns & controls:
             return RelaxedStep(condition, condition, 1, jump)
-        free = rejoined(jump.guard, lambda part: YES if columns_in(part) & controls else part)
+        free = jump.guard.map_terms(lambda part: YES if part.columns & controls else part)
         effects = (_equal(name, value) for name, value in fixed.items())
-        return RelaxedStep(joined("and", (free, *extra)), joined("and", effects), 0, jump)
+        return RelaxedStep(ir.BoolOp.joined("and", (free, *extra)), ir.BoolOp.joined("and", effects), 0, jump)
 
     def _left(self, clause: Sequence[ir.Formula], fixed: Mapping[str, ir.Num]) -> ir.Formula:
         """Return the condition of a clause, a disjunction, before a jump that sets the states `fixed`."""
-        if not any(columns_in(item) & fixed.keys() for item in clause):
+        if not any(item.columns & fixed.keys() for item in clause):
             return YES
-        if any(isinstance(node, (ir.PastTemporal, ir.Since)) for item in clause for node in nodes(item)):
+        if any(isinstance(node, (ir.PastTemporal, ir.Since)) for item in clause for node in item.walk()):
             return YES
-        here = [item for item in clause if not any(isinstance(node, ir.Shift) for node in nodes(item))]
-        return joined("or", (rejoined(substitute(item, fixed), _folded) for item in here))
+        here = [item for item in clause if not any(isinstance(node, ir.Shift) for node in item.walk())]
+        return ir.BoolOp.joined("or", (item.substitute(fixed).map_terms(_folded) for item in here))
 
     def _literals_of(self, formula: ir.Formula) -> Iterator[ir.Formula]:
         """Yield the predicates of a formula that one state decides."""
         known = {*self._names, ir.ELAPSED}
-        for node in nodes(formula):
+        for node in formula.walk():
             if isinstance(node, ir.Predicate) and all(
                 isinstance(leaf, ir.Const) or (isinstance(leaf, ir.Signal) and leaf.name in known)
-                for leaf in leaves(node)
+                for leaf in node.leaves()
             ):
                 yield node
 
     def _sort(self, literal: ir.Formula) -> Sort:
-        read = columns_in(literal)
+        read = literal.columns
         if not read <= self._own:
             return "unknown"
         if read & self.driven:
@@ -310,11 +305,11 @@ class Relaxation:
         sort = self._sort(literal)
         if sort not in ("timed", "driven"):
             return None
-        flowing = [name for name in columns_in(literal) if name in self._flow]
+        flowing = [name for name in literal.columns if name in self._flow]
         modes = dict.fromkeys(
             part.cond
             for name in flowing
-            for part in subexpressions(self._flow[name])
+            for part in self._flow[name].subexpressions()
             if isinstance(part, (ir.Indicator, ir.Where))
         )
         if sort == "driven" and not modes:
@@ -333,7 +328,7 @@ class Relaxation:
             self._rates[literal] = max(self._rates.get(literal, 0.0), found)
             return found
 
-        if not all(columns_in(self._flow[name]) <= now.keys() for name in flowing):
+        if not all(self._flow[name].columns <= now.keys() for name in flowing):
             return YES  # the flow depends on time
         if not modes:
             return ir.Truth(rate(None, holds=True) > 0.0)
@@ -341,12 +336,12 @@ class Relaxation:
         if sort == "driven" and not any((yes > 0.0) != (no > 0.0) for _, yes, no in gains):
             return None
         if (least := min(min(yes, no) for _, yes, no in gains)) < 0.0:
-            stops = [negate(mode) for mode, yes, no in gains if yes < 0.0 <= no]
+            stops = [mode.negated for mode, yes, no in gains if yes < 0.0 <= no]
             stops += [mode for mode, yes, no in gains if no < 0.0 <= yes]
-            self._stops[literal], self._falls[literal] = joined("or", stops), -least
+            self._stops[literal], self._falls[literal] = ir.BoolOp.joined("or", stops), -least
         ways = [mode for mode, yes, _ in gains if yes > 0.0]
-        ways += [negate(mode) for mode, _, no in gains if no > 0.0]
-        return joined("or", ways)
+        ways += [mode.negated for mode, _, no in gains if no > 0.0]
+        return ir.BoolOp.joined("or", ways)
 
 
 class RelaxedState:
@@ -471,19 +466,19 @@ class RelaxedState:
 def _values(formulas: Sequence[ir.Formula], env: Mapping[str, Numbers]) -> Numbers:
     """Robustness of formulas over one sample of several states, (formulas, states)."""
     width = next(iter(env.values())).shape[1]
-    found = evaluate(formulas, env, ops=NUMPY, end="lower")
+    found = evaluate(formulas, env, end="lower")
     return np.stack([np.broadcast_to(each[0], width) for each in found]) if found else np.empty((0, width))
 
 
 def clauses_of(formula: ir.Formula) -> Iterator[tuple[ir.Formula, ...]]:
     """Yield the disjunctions of a conjunction, each as the tuple of its items."""
-    for clause in terms(formula, "and"):
-        yield tuple(terms(clause, "or"))
+    for clause in formula.terms("and"):
+        yield tuple(clause.terms("or"))
 
 
 def present(formula: ir.Formula) -> ir.Formula:
     """Return a formula without its operators of the future, which become true."""
-    return rejoined(formula, lambda part: YES if looks_ahead(part) else part)
+    return formula.map_terms(lambda part: YES if looks_ahead(part) else part)
 
 
 def _conjunctions(formula: ir.Formula) -> Iterator[ir.Formula]:
@@ -494,14 +489,14 @@ def _conjunctions(formula: ir.Formula) -> Iterator[ir.Formula]:
                 yield from _conjunctions(item)
         case ir.BoolOp("and", items):
             for parts in islice(product(*map(_conjunctions, items)), MOST_LEVELS):
-                yield joined("and", parts)
+                yield ir.BoolOp.joined("and", parts)
         case _:
             yield formula
 
 
 def _folded(formula: ir.Formula) -> ir.Formula:
     """Replace a literal that reads no signal by its truth."""
-    if isinstance(formula, ir.Predicate) and not columns_in(formula):
+    if isinstance(formula, ir.Predicate) and not formula.columns:
         return ir.Truth(bool(TOLERANCE.satisfied(_values([formula], {"": np.zeros((1, 1))}))[0, 0]))
     return formula
 
@@ -516,13 +511,13 @@ def _settled(num: ir.Num, mode: ir.Formula | None, *, holds: bool = True) -> ir.
         case ir.Indicator(cond) if mode is None or cond == mode:
             return ir.Const(float(holds))
         case ir.Where(_, yes, no) if mode is None:
-            return ir.Op("add", (deeper(yes), deeper(no)))
+            return deeper(yes) + deeper(no)
         case ir.Where(cond, yes, no) if cond == mode:
             return deeper(yes if holds else no)
         case _:
-            return map_children(num, numbers=deeper)
+            return num.map_children(numbers=deeper)
 
 
 def _equal(name: str, value: ir.Num) -> ir.Formula:
-    apart = ir.Op("abs", (ir.Op("sub", (ir.Signal(name), value)),))
-    return ir.Predicate(ir.Op("sub", (ir.Const(0.5), apart)))
+    apart = (ir.Signal(name) - value).apply("abs")
+    return ir.Predicate(0.5 - apart)

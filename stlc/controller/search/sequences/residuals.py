@@ -18,11 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.normal_form import joined
-from stlc.compile.ir.support import history
-from stlc.compile.ir.traverse import map_children, nodes, operands
 from stlc.compile.semantics.tolerance import TOLERANCE
 
 YES, NO = ir.Truth(True), ir.Truth(False)
@@ -33,7 +29,7 @@ def looks_ahead(formula: ir.Formula) -> bool:
     return any(
         isinstance(node, (ir.Temporal, ir.Until, ir.AtStart))
         or (isinstance(node, ir.Shift) and node.steps > 0)
-        for node in nodes(formula)
+        for node in formula.walk()
     )
 
 
@@ -49,17 +45,17 @@ class Progression:
         self._formulas, self._steps = tuple(formulas), steps
         self._parts = list(self._formulas)
         for part in self._parts:
-            self._parts.extend(operands(part) if looks_ahead(part) else ())
+            self._parts.extend(part.operands if looks_ahead(part) else ())
         present = dict.fromkeys(part for part in self._parts if not looks_ahead(part))
-        self._here = tuple(part for part in present if not history(part))
-        self._back = tuple(part for part in present if history(part))
+        self._here = tuple(part for part in present if not part.history)
+        self._back = tuple(part for part in present if part.history)
         self._names = {part: str(i) for i, part in enumerate((*self._here, *self._back))}
         self._forms = [self._form(part) for part in self._parts]
 
     def _form(self, formula: ir.Formula) -> ir.Formula:
         """Return a formula with a signal for each part that does not look ahead; `?` is unknown."""
         if isinstance(formula, (ir.BoolOp, ir.Temporal, ir.Until)) and looks_ahead(formula):
-            return map_children(formula, formulas=self._form)
+            return formula.map_children(formulas=self._form)
         return ir.Predicate(ir.Signal(self._names.get(formula, "?")))
 
     def after(self, env: Mapping[str, NDArray[np.float64]]) -> tuple[ir.Formula, ...]:
@@ -71,8 +67,8 @@ class Progression:
         count = len(next(iter(env.values())))
         flat = {name: column.reshape(1, -1) for name, column in env.items()}
         values = (
-            *evaluate(self._here, flat, ops=NUMPY),
-            *evaluate(self._back, env, ops=NUMPY, count=count),
+            *evaluate(self._here, flat),
+            *evaluate(self._back, env, count=count),
         )
         shape = self._steps + 1, 2
         unknown = np.broadcast_to([-1.0, 1.0], shape)  # the worst or best continuation
@@ -80,7 +76,7 @@ class Progression:
         for name, value in zip(self._names.values(), values, strict=True):
             signals[name] = unknown.copy()
             signals[name][:count] = np.where(TOLERANCE.satisfied(value), 1.0, -1.0).reshape(-1, 1)
-        bounds = evaluate(self._forms, signals, ops=NUMPY, count=self._steps + 1, end="truncate")
+        bounds = evaluate(self._forms, signals, count=self._steps + 1, end="truncate")
         known = {
             id(part): np.broadcast_to(each, shape) >= 0.0
             for part, each in zip(self._parts, bounds, strict=True)
@@ -111,20 +107,20 @@ class _Residual:
         match formula:
             case ir.BoolOp(op, items):
                 left = [self.at(item, sample) for item in items]
-                return joined(op, left)
+                return ir.BoolOp.joined(op, left)
             case ir.Temporal(op, window, body):
                 ahead, seen = self._split(window, sample)
                 both: Literal["and", "or"] = "or" if op == "eventually" else "and"
                 left = [self.at(body, k) for k in self._open(body, seen)]
                 left += [] if ahead is None else [ir.Temporal(op, ahead, body)]
-                return joined(both, left)
+                return ir.BoolOp.joined(both, left)
             case ir.Until("until", window, one, other):
                 ahead, seen = self._split(window, sample)
                 held = self.known[id(one)][:, 1]
                 left = [self.at(other, k) for k in self._open(other, seen) if held[sample : k + 1].all()]
                 if ahead is not None and held[sample : self.now + 1].all():
                     left.append(ir.Until("until", ahead, one, other))
-                return joined("or", left)
+                return ir.BoolOp.joined("or", left)
             case _:
                 return YES
 

@@ -22,9 +22,6 @@ import numpy as np
 import torch
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.normal_form import joined, pieces, terms
-from stlc.compile.ir.support import columns_in, history, reach
-from stlc.compile.ir.traverse import nodes
 from stlc.controller.search.newton import values_of
 from stlc.controller.search.sequences.landmarks import Landmarks
 from stlc.controller.search.sequences.obligations import Obligations
@@ -146,11 +143,11 @@ class Sequences:
         self._untils = tuple(
             node for node in obligations if isinstance(node, ir.Until) and not looks_ahead(node.left)
         )
-        self._kept = tuple(ir.BoolOp("or", (each.left, present(each.right))) for each in self._untils)
+        self._kept = tuple(each.left | present(each.right) for each in self._untils)
         self._safe = tuple(
             self._obligations.within(piece.body)
             for rule in task.rules
-            for piece in pieces(rule.formula)
+            for piece in rule.formula.pieces
             if isinstance(piece, ir.Temporal) and piece.op == "always" and not looks_ahead(piece.body)
         )
         conditions = dict.fromkeys(each for formula in obligations for each in self._conditions(formula))
@@ -164,7 +161,7 @@ class Sequences:
             clause
             for formula in (*self._safe, *self._kept)
             for clause in clauses_of(formula)
-            if all(columns_in(each) <= own and not history(each) for each in clause)
+            if all(each.columns <= own and not each.history for each in clause)
         ]
         moved = self._relaxation.driven - {*self._relaxation.modes}
         ranges = {each.name: each for each in task.system.decl.signature.columns if each.name in moved}
@@ -184,22 +181,22 @@ class Sequences:
         controls = frozenset(system.control_names)
         for assign in system.decl.flow:
             low, high = system.decl.signature[assign.name].low, system.decl.signature[assign.name].high
-            driven = assign.name in self._relaxation.driven and not columns_in(assign.value) & controls
+            driven = assign.name in self._relaxation.driven and not assign.value.columns & controls
             if driven and low is not None and high is not None:
                 speed = DRIFT * (high - low) / (self.steps * system.dt)
-                margin = ir.Op("sub", (ir.Const(speed), ir.Op("abs", (assign.value,))))
+                margin = ir.Const(speed) - assign.value.apply("abs")
                 slow.append(ir.Predicate(margin))
-        return joined("and", slow)
+        return ir.BoolOp.joined("and", slow)
 
     @cached_property
     def _phases(self) -> Phases | None:
-        safe, scale = joined("and", self._safe), self._scales(self._targets, self._state)
+        safe, scale = ir.BoolOp.joined("and", self._safe), self._scales(self._targets, self._state)
         known = frozenset(self.task.system.names)
         clauses = [
             [part for part in clause if isinstance(part, ir.Predicate)]
             for formula in self._safe
             for clause in clauses_of(formula)
-            if all(isinstance(part, ir.Predicate) and columns_in(part) <= known for part in clause)
+            if all(isinstance(part, ir.Predicate) and part.columns <= known for part in clause)
         ]
         return Phases.of(self.task.system, safe, self._targets, self._kept, self.steps, scale, clauses)
 
@@ -236,7 +233,7 @@ class Sequences:
     def _scales(self, targets: Sequence[ir.Formula], state: Tensor) -> Callable[[ir.Formula], float]:
         """Return a function from a predicate of the targets to the typical size of its margin."""
         literals = list[ir.Formula](
-            dict.fromkeys(part for each in targets for part in nodes(each) if isinstance(part, ir.Predicate))
+            dict.fromkeys(part for each in targets for part in each.walk() if isinstance(part, ir.Predicate))
         )
         plans = extremes(self.task, torch.Generator().manual_seed(0)).double()[:PROBES]
         states = self.task.rollout(state.expand(len(plans), -1), plans)
@@ -264,12 +261,12 @@ class Sequences:
             return [] if isinstance(formula, ir.Truth) else [formula]
         match formula:
             case ir.Temporal("always", _, body) if not looks_ahead(body):
-                return [formula] if reach(formula).future <= self.steps // 2 else [body]
+                return [formula] if formula.reach.future <= self.steps // 2 else [body]
             case ir.BoolOp("or", items):
                 return [each for item in items for each in self._alternatives(item)]
             case ir.BoolOp("and", items):
                 parts = [found for item in items if (found := self._alternatives(item))]
-                whole = [joined("and", combined) for combined in product(*parts)] if parts else []
+                whole = [ir.BoolOp.joined("and", combined) for combined in product(*parts)] if parts else []
                 return whole[:ALTERNATIVES]
             case _:
                 return []
@@ -442,7 +439,7 @@ class Sequences:
         due = min((goal.last for goal in node.goals if node.relaxed.cost(goal.condition)), default=rest)
         for goal in sorted(node.goals, key=lambda goal: goal.last):
             if goal.first <= due and node.relaxed.ready(goal.condition):
-                after = reach(goal.condition).future
+                after = goal.condition.reach.future
                 last = min(goal.last, most - after)
                 first = goal.first if goal.first <= last else 0
                 found.append(PhaseRequest(goal.target, first, last, opened, after))
@@ -510,7 +507,7 @@ def _is_kept(formula: ir.Formula) -> bool:
 
 def _needed(formulas: Sequence[ir.Formula]) -> tuple[ir.Formula, ...]:
     """Return the parts of a conjunction without goals that are met whenever another one is."""
-    parts = list(dict.fromkeys(part for formula in formulas for part in terms(formula, "and")))
+    parts = list(dict.fromkeys(part for formula in formulas for part in formula.terms("and")))
 
     def later(one: ir.Formula, other: ir.Formula) -> bool:
         match one, other:

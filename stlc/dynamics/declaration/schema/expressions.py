@@ -19,7 +19,6 @@ from stlc.compile.frontend.expressions import (
 from stlc.compile.frontend.scope import Entry, Scope
 from stlc.compile.frontend.values import Number
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import columns_in
 from stlc.diagnostics import Diagnostic, StlcError
 from stlc.dynamics.declaration.schema.reader import Reader, first_line
 from stlc.dynamics.declaration.schema.yaml_nodes import Node, Scalar
@@ -254,9 +253,9 @@ class Expressions:
                 return None
             case ast.Bool(_, value):
                 return ir.Const(float(value))
-            case ast.Compare() | ast.Not() | ast.Logic() | ast.Member():
+            case _ if expr.is_formula:
                 formula = self.formula_of(expr)
-                return None if formula is None else ir.Indicator(formula)
+                return None if formula is None else formula.indicator()
             case _:
                 return self.stored(node, where, Unit())
 
@@ -342,7 +341,7 @@ def _columns(found: Number | tuple[Number, ...] | ir.Formula) -> frozenset[str]:
     """Names of the columns that a number, several numbers or a formula read."""
     if isinstance(found, tuple):
         return frozenset().union(*map(_columns, found))
-    return columns_in(found.num if isinstance(found, Number) else found)
+    return (found.num if isinstance(found, Number) else found).columns
 
 
 def written(node: Node | None) -> str:

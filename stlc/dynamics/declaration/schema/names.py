@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import ClassVar, Literal, TypeAlias
 
-from stlc.compile.frontend.scope import Entry, Known, Scope, enforced
+from stlc.compile.frontend.scope import Entry, Known, Scope
 from stlc.compile.frontend.values import Number, VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import SystemFileError
@@ -17,7 +17,7 @@ from stlc.dynamics.declaration.schema.reader import Reader
 from stlc.dynamics.declaration.schema.yaml_nodes import Scalar
 from stlc.grammar import ast
 from stlc.jsontext import Num
-from stlc.signature import Column
+from stlc.signature import Column, Signature
 from stlc.source import Span
 from stlc.units import Unit
 
@@ -108,7 +108,8 @@ class Names:
 
     def expressions(self, reader: Reader) -> Expressions:
         """Return a compiler of expressions that knows all names declared up to now."""
-        scope = Scope(dict(self.entries), error=SystemFileError, ranges=enforced(self.columns))
+        ranges = Signature(tuple(self.columns)).enforced
+        scope = Scope(dict(self.entries), error=SystemFileError, ranges=ranges)
         return Expressions(reader, scope)
 
     def group(self, name: str) -> tuple[Column, ...]:

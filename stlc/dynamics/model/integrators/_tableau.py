@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import add, multiply
 
 State: TypeAlias = Mapping[str, ir.Num]
 Rate: TypeAlias = Callable[[State], State]
@@ -58,7 +57,7 @@ def _moved(state: State, slopes: Sequence[State], weights: Sequence[float], leng
     if len(groups) == 1:
         (scale,) = groups
         groups, length = {1.0: groups[scale]}, length * scale
-    moved = {name: add(state[name], multiply(ir.Const(length), _sum(groups, name))) for name in slopes[0]}
+    moved = {name: state[name] + ir.Const(length) * _sum(groups, name) for name in slopes[0]}
     return {**state, **moved}
 
 
@@ -68,8 +67,8 @@ def _sum(groups: Mapping[float, Sequence[State]], name: str) -> ir.Num:
     for weight, slopes in groups.items():
         part = slopes[0][name]
         for slope in slopes[1:]:
-            part = add(part, slope[name])
-        part = part if weight == 1.0 else multiply(ir.Const(float(weight)), part)
-        total = part if total is None else add(total, part)
+            part = part + slope[name]
+        part = part if weight == 1.0 else ir.Const(float(weight)) * part
+        total = part if total is None else total + part
     assert total is not None
     return total

@@ -14,7 +14,6 @@ from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import add, multiply
 from stlc.dynamics.model.derivative import derivative
 from stlc.dynamics.model.integrators._tableau import Rate, State
 
@@ -39,15 +38,15 @@ class Rosenbrock:
         system = _Elimination(here, state, -self.gamma * length, named)
         first = system.solved(here)
         middle = rate({**state, **_moved(state, first, length)})
-        twice = {name: multiply(ir.Const(2.0), num) for name, num in first.items()}
-        second = system.solved({name: ir.Op("sub", (middle[name], twice[name])) for name in here})
+        twice = {name: 2.0 * num for name, num in first.items()}
+        second = system.solved({name: middle[name] - twice[name] for name in here})
         half = _moved(state, first, 1.5 * length)
         return {**state, **_moved(half, second, 0.5 * length)}
 
 
 def _moved(state: State, slopes: State, length: float) -> State:
     """Return the states that have slopes, `length` seconds later."""
-    return {name: add(state[name], multiply(ir.Const(length), slope)) for name, slope in slopes.items()}
+    return {name: state[name] + ir.Const(length) * slope for name, slope in slopes.items()}
 
 
 class _Elimination:
@@ -72,17 +71,17 @@ class _Elimination:
         values = dict(self._named(right))
         for pivot, factors in self._steps:
             for name, factor in factors.items():
-                values[name] = ir.Op("sub", (values[name], multiply(factor, values[pivot])))
+                values[name] = values[name] - factor * values[pivot]
             values |= self._named({name: values[name] for name in factors})
         done: dict[str, ir.Num] = {}
         for pivot, _ in reversed(self._steps):
             num = values[pivot]
             for name, entry in self._rows[pivot].items():
                 if name in done:
-                    num = ir.Op("sub", (num, multiply(entry, done[name])))
+                    num = num - entry * done[name]
             diagonal = self._rows[pivot][pivot]
             if diagonal != ir.Const(1.0):
-                num = ir.Op("div", (num, diagonal))
+                num = num / diagonal
             done |= self._named({pivot: num})
         return {name: done[name] for name in right}
 
@@ -95,20 +94,14 @@ class _Elimination:
         """Subtract multiples of the row of `pivot` from the rows in `left` that have an entry there."""
         rows = self._rows
         rows[pivot] = dict(self._named(rows[pivot]))
-        found = {
-            name: ir.Op("div", (rows[name].pop(pivot), rows[pivot][pivot]))
-            for name in left
-            if pivot in rows[name]
-        }
+        found = {name: rows[name].pop(pivot) / rows[pivot][pivot] for name in left if pivot in rows[name]}
         factors = self._named(found)
         for name, factor in factors.items():
             for other in left:
                 if other in rows[pivot]:
-                    change = multiply(factor, rows[pivot][other])
+                    change = factor * rows[pivot][other]
                     before = rows[name].get(other)
-                    rows[name][other] = (
-                        ir.Op("neg", (change,)) if before is None else ir.Op("sub", (before, change))
-                    )
+                    rows[name][other] = -change if before is None else before - change
         self._steps.append((pivot, factors))
 
 
@@ -119,8 +112,8 @@ def _row(rates: State, state: State, name: str, scale: float) -> MutableMapping[
         at = state[other]
         slope = derivative(rates[name], at.name) if isinstance(at, ir.Signal) else None
         if slope is not None:
-            entry = multiply(ir.Const(scale), slope)
-            row[other] = add(ir.Const(1.0), entry) if other == name else entry
+            entry = ir.Const(scale) * slope
+            row[other] = 1.0 + entry if other == name else entry
     return row
 
 

@@ -16,7 +16,7 @@ from stlc.controller.search.local_search import Searcher
 from stlc.controller.search.planner import PlanBudget, PlanSearch, plan
 from stlc.diagnostics import UsageError
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 pytestmark = pytest.mark.apart
@@ -55,7 +55,7 @@ def boat(tmp_path_factory: pytest.TempPathFactory) -> System:
 
 
 def task_of(system: System, text: str) -> Task:
-    return Task.of(parse(Source("boat.stl", f"signal p, q, v, h, n\nrequire r: {text}")), system)
+    return Task.of(Spec.parse(Source("boat.stl", f"signal p, q, v, h, n\nrequire r: {text}")), system)
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.signature import Column
 from stlc.source import Source
 
@@ -60,7 +60,7 @@ def shown(
 ) -> str:
     """Output of the view of a deployment, all pictures after one another."""
     task = Task.of(
-        parse(Source("a.stl", SPEC)), System(parse_system(Source("dot.yaml", SYSTEM), Path("dot.yaml")))
+        Spec.parse(Source("a.stl", SPEC)), System(parse_system(Source("dot.yaml", SYSTEM), Path("dot.yaml")))
     )  # type: ignore[arg-type]
     setting = Setting(tuple(range(seeds)), 6, steps)
     stream = io.StringIO()

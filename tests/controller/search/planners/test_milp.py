@@ -15,7 +15,7 @@ from stlc.controller.search.planner import PlanBudget, PlanSearch, plan
 from stlc.controller.search.planners import milp
 from stlc.diagnostics import UsageError
 from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.grammar.spec import Spec
 from stlc.source import Source
 
 pytest.importorskip("highspy")
@@ -81,7 +81,7 @@ def cart(tmp_path_factory: pytest.TempPathFactory) -> System:
 
 
 def task_of(system: System, text: str) -> Task:
-    return Task.of(parse(Source("cart.stl", f"signal p, v, n\nrequire r: {text}")), system)
+    return Task.of(Spec.parse(Source("cart.stl", f"signal p, v, n\nrequire r: {text}")), system)
 
 
 def tried(task: Task, x0: torch.Tensor) -> torch.Tensor:
@@ -166,7 +166,7 @@ def test_no_proof_is_contradicted_at_the_boundary_of_a_condition(
     path = tmp_path_factory.mktemp("piecewise") / "piecewise.yaml"
     path.write_text(PIECEWISE.format(mode=mode, p=p, q=q, h=h))
     system = System.load(path)
-    task = Task.of(parse(Source("piecewise.stl", f"signal p, q, h\nrequire r: {text}")), system)
+    task = Task.of(Spec.parse(Source("piecewise.stl", f"signal p, q, h\nrequire r: {text}")), system)
     task.__dict__["native"] = None
     x0 = torch.zeros(1, len(system.names), dtype=torch.float64)
     x0[:, system.names.index("p")] = start
