@@ -107,6 +107,11 @@ class ArrayProgram:
         free = ("input", "pick")
         return sum(tape.code[i].kernel not in free for i in _needed(tape, outputs.values()))
 
+    def instructions(self) -> tuple[dict[int, Instr], dict[str, Operand]]:
+        """Instructions in order, by the register that they write, and outputs; conditions are exact."""
+        tape, outputs = self._tape(exact=True)
+        return {register: tape.code[register] for register in _needed(tape, outputs.values())}, outputs
+
     def _tape(self, *, exact: bool) -> tuple[GradientTape, dict[str, Operand]]:
         if exact not in self._tapes:
             writer = _TapeWriter(self._constants, exact=exact)

@@ -129,4 +129,5 @@ def kernel_library(dtype: str, *, few: bool = True) -> ctypes.CDLL | None:
         pointers, numbers = [ctypes.c_void_p] * 3, [ctypes.c_int64] * 4
         library.double_all.argtypes = [*pointers[1:], *numbers, ctypes.c_int]
         library.end_all.argtypes = [*pointers, *numbers[1:], ctypes.c_int]
+        library.run_all.argtypes = [ctypes.c_char_p, numbers[0], pointers[0], *numbers[:2]]
     return library

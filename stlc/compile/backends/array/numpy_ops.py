@@ -112,14 +112,18 @@ class NumpyOps(FloatConstants, ScanByRows):
             out = choose(out, item, out=out) if here else choose(out, item)
         return out
 
+    def kernel_pays(self, x: Array) -> bool:
+        """Count the elements of an array; True if building the C kernel pays off for all so far."""
+        self._seen += x.size
+        return self._seen >= _MANY
+
     def windows(self, operands: Sequence[Array], pick: Pick, window: Sliding) -> Array | None:
         """Exact extrema over sliding windows, or `until`, by the C kernel.
 
         The result is None if array operations of NumPy are faster, or if no kernel is available.
         """
-        first = operands[0]
-        self._seen += first.size
-        if first.ndim != 2 or self._seen < _MANY or any(each.dtype != first.dtype for each in operands):
+        first, pays = operands[0], self.kernel_pays(operands[0])
+        if first.ndim != 2 or not pays or any(each.dtype != first.dtype for each in operands):
             return None
         name, traces = _NAMES.get(first.dtype.char, ""), first.shape[1]
         rows, count, width = window.rows, window.count, window.width

@@ -10,13 +10,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any, TypeAlias, assert_never, final
 
 import numpy as np
 
-from stlc.compile.backends.array.arith import ArrayProgram, inputs
+from stlc.compile.backends.array.arith import inputs
+from stlc.compile.backends.array.batches import Batch, StepSource, batches_of
 from stlc.compile.backends.array.frozen import Freezer
+from stlc.compile.backends.array.fused import MOST, Fused, fused
+from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.backends.schedule import (
     PICKS,
@@ -25,10 +28,8 @@ from stlc.compile.backends.schedule import (
     ScheduleStep,
     TraceDomain,
     neutral,
-    reads,
     schedule,
     spanning,
-    within,
 )
 from stlc.compile.ir import nodes as ir
 from stlc.compile.namespace import Array, Ops, Pick
@@ -50,54 +51,40 @@ _ENDLESS = 1 << 60
 """Width of a window to the end of the trace, in rows."""
 
 
-# --------------------------------------------------------------------------- predicates
-
-
-@dataclass(frozen=True, slots=True)
-class Batch:
-    """Program that computes several predicates at the same instants, which lie within the trace.
-
-    Attributes:
-        run: the instants.
-        program: the program; each of its outputs is the margin of a predicate.
-    """
-
-    run: IndexRange
-    program: ArrayProgram
-
-
-@dataclass(frozen=True, slots=True)
-class StepSource:
-    """Source of a predicate's values: an output of a program, or a signal.
-
-    Attributes:
-        batch: index of the program in `ArrayPlan.batches`; None for a signal.
-        name: name of the output, or of the signal.
-        inside: instants of the step at which the predicate is defined: all samples that it reads exist.
-    """
-
-    batch: int | None
-    name: str
-    inside: IndexRange
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ArrayPlan:
     """An evaluation schedule with the programs and functions that compute its steps.
 
     Attributes:
         schedule: the steps; a step is a sub-formula at a range of instants.
         batches: programs of the predicates.
+        sources: number of a predicate's step -> source of its values.
+        machine: builder of the functions of the steps.
         runners: functions of the steps, in order.
         beyond: number of instants beyond the last sample, summed over all steps.
-        ops: the array library.
     """
 
     schedule: Schedule
     batches: tuple[Batch, ...]
+    sources: Mapping[int, StepSource]
+    machine: Machine
     runners: tuple[Runner, ...]
     beyond: int
-    ops: Ops
+
+    @property
+    def ops(self) -> Ops:
+        """The array library."""
+        return self.machine.windows.ops
+
+    def _in_c(self, env: Mapping[str, Array]) -> bool:
+        """True if one call of C is faster than the calls of NumPy."""
+        like, windows, domain = next(iter(env.values())), self.machine.windows, self.schedule.domain
+        short = windows.ops is NUMPY and like.ndim == 2 and like.size <= MOST and not self.beyond
+        return short and windows.semantics.exact and domain.end != "both" and NUMPY.kernel_pays(like)  # type: ignore[attr-defined]
+
+    @cached_property
+    def _fused(self) -> Fused | None:
+        return fused(self.schedule, self.batches, self.sources, self.machine.unknown)
 
     def values(self, env: Mapping[str, Array]) -> list[Array]:
         """Return the values of all steps, `(count, batch)` each; `env`: signal name -> array `(time, batch)`.
@@ -119,6 +106,9 @@ class ArrayPlan:
 
     def roots(self, env: Mapping[str, Array]) -> list[Array]:
         """Return the values of the formulas, as `values` does."""
+        found = self._fused.run(env) if self._in_c(env) and self._fused is not None else None
+        if found is not None:
+            return found
         values = self.values(env)
         return [values[root] for root in self.schedule.roots]
 
@@ -132,60 +122,10 @@ def array_plan(
     treatment of instants beyond its last sample.
     """
     found, machine = schedule(formulas, run, domain), Machine(domain, windows)
-    batches, predicates = _batches(found.steps, domain)
+    batches, sources = batches_of(found.steps, domain)
     stops = ((step.run.last - domain.samples + 1, step.run.count) for step in found.steps)
-    runners = tuple(_runner(step, machine, predicates.get(step.number), batches) for step in found.steps)
-    return ArrayPlan(found, batches, runners, sum(max(min(stop), 0) for stop in stops), windows.ops)
-
-
-def _batches(
-    steps: Sequence[ScheduleStep], domain: TraceDomain
-) -> tuple[tuple[Batch, ...], dict[int, StepSource]]:
-    """Group the predicates that are evaluated at the same instants into programs.
-
-    Returns the programs, and a mapping from the step number of a predicate to the source of its values. A
-    predicate whose margin is just a signal, such as `x > 0`, needs no program.
-    """
-    wanted: dict[ir.Num, list[tuple[IndexRange, int]]] = {}
-    predicates: dict[int, StepSource] = {}
-    for index, step in enumerate(steps):
-        if isinstance(step.node, ir.Predicate):
-            inside = within(reads(step.node.num, domain), step.run, domain)
-            if inside.count > 0 and isinstance(step.node.num, ir.Signal) and step.node.sign > 0:
-                predicates[index] = StepSource(None, step.node.num.name, inside)
-            elif inside.count > 0:
-                margin = step.node.num if step.node.sign > 0 else -step.node.num
-                wanted.setdefault(margin, []).append((inside, index))
-    grouped: dict[IndexRange, dict[ir.Num, list[tuple[IndexRange, int]]]] = {}
-    for num, ranges in wanted.items():
-        for merged, indices in _merged(ranges):
-            grouped.setdefault(merged, {})[num] = indices
-    batches = []
-    for number, (merged, nums) in enumerate(grouped.items()):
-        outputs = {str(i): num for i, num in enumerate(nums)}
-        batches.append(Batch(merged, ArrayProgram(outputs)))
-        for i, indices in enumerate(nums.values()):
-            predicates.update({index: StepSource(number, str(i), inside) for inside, index in indices})
-    return tuple(batches), predicates
-
-
-def _merged(ranges: list[tuple[IndexRange, int]]) -> list[tuple[IndexRange, list[tuple[IndexRange, int]]]]:
-    """Merge overlapping and adjacent ranges of instants, such as 0 to 3 and 4 to 6.
-
-    Args:
-        ranges: pairs of a range and the number of the step that is evaluated there.
-
-    Returns:
-        Pairs of a merged range and the list of the given pairs that it covers.
-    """
-    out: list[tuple[IndexRange, list[tuple[IndexRange, int]]]] = []
-    for run, index in sorted(ranges, key=lambda item: (item[0].start, item[0].count)):
-        if out and run.start <= out[-1][0].last + 1:
-            whole, indices = out[-1]
-            out[-1] = (IndexRange(whole.start, max(whole.last, run.last)), [*indices, (run, index)])
-        else:
-            out.append((run, [(run, index)]))
-    return out
+    runners = tuple(_runner(step, machine, sources.get(step.number), batches) for step in found.steps)
+    return ArrayPlan(found, batches, sources, machine, runners, sum(max(min(stop), 0) for stop in stops))
 
 
 # -------------------------------------------------------------------------------- steps

@@ -311,3 +311,53 @@ int until_all(REAL **arrays, const int64_t *shape, int max, int how)
 {
     return how == VALUES ? JUDGED(2, until, VALUES) : how == PULL ? JUDGED(2, until, PULL) : JUDGED(2, until, PUSH);
 }
+
+/* A step of the plan of a short trace. Numbers are in places, a base and a row there: base 0 is working memory,
+   the others are arrays that are given. Without a second place, `number` stands for it. */
+typedef struct { int64_t base, row; } Place;
+typedef struct { int64_t kind, max, rows, count, width; Place x, y, to; REAL number; } Step;
+
+enum { COPY, ABS, NEG, ADD, MUL, PICK, FILL, WINDOW };
+
+#define EACH(value) \
+    for (int64_t i = 0; i < n; i++) { \
+        const REAL a = x[i], b = y ? y[i] : number; \
+        (void)b; \
+        to[i] = (value); \
+    } \
+    break
+
+/* Returns other than 0 where there is no memory for `room` rows. */
+int run_all(const Step *steps, int64_t many, REAL **bases, int64_t room, int64_t traces)
+{
+    REAL *memory = malloc((size_t)(room * traces + 1) * sizeof(REAL));
+    int failed = !memory;
+    bases[0] = memory;
+    for (const Step *s = steps; s < steps + many && !failed; s++) {
+        const REAL *x = bases[s->x.base] + s->x.row * traces, number = s->number;
+        const REAL *y = s->y.base < 0 ? 0 : bases[s->y.base] + s->y.row * traces;
+        REAL *to = bases[s->to.base] + s->to.row * traces;
+        const int64_t n = s->count * traces;
+        switch (s->kind) {
+        case COPY: memcpy(to, x, (size_t)n * sizeof(REAL)); break;
+        case ABS: EACH((REAL)fabs(a));
+        case NEG: EACH(-a);
+        case ADD: EACH(a + b);
+        case MUL: EACH(a * b);
+        case PICK:
+            if (s->max) { EACH(BETTER(a, b, 1)); } else { EACH(BETTER(a, b, 0)); }
+            break;
+        case FILL:
+            for (int64_t i = 0; i < n; i++)
+                to[i] = number;
+            break;
+        case WINDOW:
+            if (s->width >= s->rows)
+                end_all(0, x, to, s->rows, s->count, traces, (int)s->max);
+            else
+                failed = double_all(x, to, s->rows, s->count, s->width, traces, (int)s->max);
+        }
+    }
+    free(memory);
+    return failed;
+}
