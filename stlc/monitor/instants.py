@@ -21,6 +21,7 @@ from stlc.compile.backends.schedule import Boundary
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined_at
 from stlc.compile.ir.discretize import Grid
+from stlc.compile.ir.support import Reach
 from stlc.compile.namespace import Array
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import Diagnostic, usage
@@ -53,6 +54,19 @@ def window_of(rule: CompiledRequirement, horizon: int | None) -> int | None:
     None if the formula does not mention `end`, or if not every planning window is evaluated.
     """
     return horizon if rule.windowed and rule.uses_end and not rule.absolute else None
+
+
+def span_of(rule: CompiledRequirement, horizon: int | None) -> Reach:
+    """Samples before and after an instant that the value of a requirement there may depend on.
+
+    `FAR` stands for all of them. `horizon` is the length of a planning window in steps.
+    """
+    formula, window = rule.formula, window_of(rule, horizon)
+    ahead = rule.reach if window is None else window
+    later = max((num.farthest.future for num in formula.numbers()), default=0)
+    lasting = window is None and formula.endless
+    past = FAR if rule.absolute or formula.counts else formula.history
+    return Reach(past, FAR if lasting else ahead + later)
 
 
 def rule_bounds(

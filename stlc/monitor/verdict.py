@@ -37,11 +37,11 @@ from stlc.monitor.instants import (
     rule_bounds,
     rule_known,
     rule_signal,
+    span_of,
     starts_of,
     window_of,
 )
 from stlc.monitor.judgement import About, Bools, RequirementVerdict, Verdict, chosen
-from stlc.monitor.prefix_bounds import FAR
 from stlc.monitor.prepared import Part, Prepared
 from stlc.monitor.signals import WHOLE, Excerpt, Need, arrange, needs_of, plain_columns, reading_of
 from stlc.monitor.uncertain import Uncertainties, outer, outer_of, uncertain_record
@@ -398,15 +398,9 @@ def _plan(selected: _Selection, samples: int, end: Boundary, at: int | None) -> 
 def _selection(compiled: Compiled, names: Sequence[str], plain: bool) -> _Selection:
     rules, horizon = _chosen(compiled, names), compiled.grid.horizon
     needs = needs_of(compiled, [*rules, *compiled.assumptions] if plain else rules)
-    past, future = 0, 0
-    for rule in rules:
-        formula = rule.formula
-        counted = formula.counts
-        past = max(past, FAR if rule.absolute or counted else formula.history)
-        lasting = rule.uses_end and window_of(rule, horizon) is None
-        later = max((num.farthest.future for num in formula.numbers()), default=0) + (horizon or 0)
-        future = max(future, FAR if lasting else rule.reach + later)
-    return _Selection(compiled, rules, needs, tuple(rule.factor for rule in rules), Reach(past, future))
+    spans = (span_of(rule, horizon) for rule in rules)
+    reach = Reach(*map(max, zip(*spans, strict=True)))
+    return _Selection(compiled, rules, needs, tuple(rule.factor for rule in rules), reach)
 
 
 def _chosen(compiled: Compiled, names: Sequence[str]) -> tuple[CompiledRequirement, ...]:

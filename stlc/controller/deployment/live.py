@@ -2,22 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.semantics.tolerance import StatusInScope
+from stlc.compile.semantics.tolerance import StatusInScope, status_of
 from stlc.controller.guard.candidates import SOURCES
 from stlc.jsontext import Count, Num
-from stlc.monitor.online.margins import Margin, Margins
+from stlc.monitor.online.online import Online
 
 if TYPE_CHECKING:
     from stlc.controller.deployment.batched import Setting
     from stlc.controller.deployment.simulator import SimulationStep
     from stlc.controller.problem.task import Task
+
+
+@dataclass(frozen=True, slots=True)
+class Margins:
+    """Margin of a requirement (`stlc.monitor.online.online.Margin`) for each agent, (agents,)."""
+
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    violated: NDArray[np.int64]
+    open: NDArray[np.int64]
+
+    @staticmethod
+    def of(monitors: Sequence[Online], name: str) -> Margins:
+        """Return the margins of the requirement `name`; each agent has a monitor."""
+        return Margins(*map(np.array, zip(*(online.margin(name) for online in monitors), strict=True)))
+
+    def status(self, agent: int) -> StatusInScope:
+        """Violated if the agent violated it at any start, satisfied if it did at none and none is open."""
+        return status_of(bool(self.violated[agent]), not self.open[agent])
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +77,7 @@ class RobustnessLine:
 class LiveMonitor:
     """Online monitor of all agents of a deployment; it evaluates the same requirements as `stlc check`.
 
-    `push` only stores the states; the robustness margins are computed when `margins` is read.
+    `push` only stores the states; the robustness margins are computed when `margins` is called.
 
     Args:
         task: specification and system.
@@ -69,20 +88,31 @@ class LiveMonitor:
         self.task, self.setting = task, setting
         self.moment: SimulationStep | None = None
         self.counts: NDArray[np.int64] = np.zeros(len(SOURCES), dtype=np.int64)
-        self._margins = Margins(task.compiled.recorded, task.window)
+        self._names = [rule.name for rule in task.compiled.recorded]
+        self._monitors: list[Online] = []
+        self._states: list[NDArray[np.float64]] = []
+        self._found: dict[str, Margins] = {}
 
     def push(self, moment: SimulationStep) -> None:
         """Append the next step of the deployment."""
         self.moment = moment
-        states = moment.x.numpy(force=True)
-        self._margins.push(dict(zip(self.task.system.names, states.T, strict=True)))
+        self._states.append(moment.x.numpy(force=True))
         if moment.decision is not None:
             self.counts += np.bincount(moment.decision.source.numpy(force=True), minlength=len(SOURCES))
 
     @property
-    def margins(self) -> dict[str, Margin]:
-        """Lower and upper bounds on the robustness of every requirement, given the samples until now."""
-        return self._margins.evaluate()
+    def margins(self) -> dict[str, Margins]:
+        """Bounds on the robustness of every requirement, given the samples until now; there is one."""
+        if self._states:
+            states = np.stack(self._states, axis=1, dtype=np.float64)  # (agents, samples, states)
+            self._states.clear()
+            compiled = self.task.compiled
+            self._monitors = self._monitors or [Online(compiled, compiled.recorded) for _ in states]
+            columns = [self.task.system.names.index(name) for name in self._monitors[0].signals]
+            for online, rows in zip(self._monitors, states, strict=True):
+                online.push_block(rows[:, columns])
+            self._found = {name: Margins.of(self._monitors, name) for name in self._names}
+        return self._found
 
     @property
     def time(self) -> float:

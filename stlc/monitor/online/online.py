@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -73,6 +73,23 @@ class How:
     tolerance: float = TOLERANCE
     t0: float = 0.0
     reasons: bool = False
+
+
+class Margin(NamedTuple):
+    """Robustness margin of a requirement at the latest sample.
+
+    Attributes:
+        low: least robustness over all continuations; where the requirement is evaluated at every sample, the
+            minimum over the windows that contain the latest one.
+        high: greatest robustness over all continuations, or its minimum over the same windows.
+        fails: number of starts at which the requirement is certainly violated.
+        open: number of starts at which it is undecided.
+    """
+
+    low: float
+    high: float
+    fails: int
+    open: int
 
 
 Watched: TypeAlias = Streamed | Recomputed
@@ -287,6 +304,17 @@ class Online:
             raise usage(f"`{name}` is not open at sample {start}")
         judged = watched.live(range(start, start + 1))
         return float(judged.low[0]), float(judged.high[0])
+
+    def margin(self, name: str) -> Margin:
+        """Robustness margin of the requirement `name` at the latest sample, of which there is one."""
+        watched = self._find(name)
+        tally = watched.tally
+        low, high, holds, fails = watched.live(watched.asked.starts(tally.next, self.samples))
+        ends = np.array((low, high))
+        if tally.instants:
+            ends = np.c_[ends, watched.counted]
+        least, most = ends.min(1).tolist()
+        return Margin(least, most, tally.fails + int(fails.sum()), len(low) - int((holds | fails).sum()))
 
     def standing(self, name: str) -> RequirementSummary:
         """Summary of the requirement `name` over all samples at which it has been evaluated up to now.

@@ -19,10 +19,10 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.tolerance import Status
 from stlc.diagnostics import usage
-from stlc.monitor.instants import cut_bounds, growing_bounds, rule_bounds, window_of
+from stlc.monitor.instants import cut_bounds, growing_bounds, rule_bounds, span_of, window_of
 from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.tally import Asked, Flags, JudgedInstants, RequirementSummary
-from stlc.monitor.prefix_bounds import prefix_bound, with_seen
+from stlc.monitor.prefix_bounds import FAR, prefix_bound, with_seen
 from stlc.monitor.values import Ends, Record
 
 MOST = 1 << 26
@@ -56,27 +56,19 @@ class GrowingBounds:
     horizon: int | None
     ending: Ends
 
-    @property
-    def _window(self) -> int | None:
-        return window_of(self.rule, self.horizon)
-
-    @property
-    def _lasting(self) -> bool:
-        return self._window is None and self.rule.formula.endless
-
     def settled(self, samples: int) -> int:
         """The first instant at which a sample after `samples` of them may change the value."""
-        ahead = self.rule.reach if self._window is None else self._window
-        later = max((num.farthest.future for num in self.rule.formula.numbers()), default=0)
-        return 0 if self._lasting else max(samples - ahead - later, 0)
+        return max(samples - span_of(self.rule, self.horizon).future, 0)
 
     def needs(self, start: int) -> int:
         """The first sample that instants from `start` on read."""
-        return 0 if self.rule.absolute or self._lasting else max(start - self.rule.formula.history, 0)
+        span = span_of(self.rule, self.horizon)
+        return 0 if span.future == FAR else max(start - span.past, 0)
 
     def live(self, signals: Columns, starts: range) -> tuple[Floats, Floats]:
         """Least and greatest robustness over all continuations, (instants, traces) each."""
-        window, cut, formula, parts = self._window, self.ending == "truncate", self.rule.formula, []
+        window, cut = window_of(self.rule, self.horizon), self.ending == "truncate"
+        formula, parts = self.rule.formula, []
         record = Record.of(with_seen(signals))
         middle = min(max(self.settled(record.samples), starts.start), starts.stop) if cut else starts.start
         if known := range(starts.start, middle):

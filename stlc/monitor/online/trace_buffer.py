@@ -14,10 +14,11 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.monitor.explain.report import Cause, cause_of
-from stlc.monitor.instants import rule_bounds, window_of
+from stlc.monitor.instants import rule_bounds, span_of
 from stlc.monitor.judgement import RequirementVerdict
 from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.tally import RequirementSummary
+from stlc.monitor.prefix_bounds import FAR
 from stlc.monitor.prepared import Part, Prepared
 from stlc.monitor.signals import Signals
 from stlc.monitor.values import Record
@@ -89,41 +90,18 @@ class TraceBuffer:
 
         The instant is counted from the first sample. None if needed samples were dropped.
         """
-        history, horizon = self._history, self.compiled.grid.horizon
-        formula = rule.lowered
-        reads = _around(rule, formula, horizon)
-        if reads is None and history.first:
-            formula = rule.formula
-            reads = _around(rule, formula, horizon)
-        lasting = _endless_always(rule, formula)
-        if not history.first and (reads is None or lasting):
+        history, top = self._history, rule.lowered
+        whole = replace(rule, formula=top, reach=top.reach.future)
+        past, future = span_of(whole, self.compiled.grid.horizon)
+        if future < FAR:
+            start, first, stop = at, max(at - past, 0), at + future + 1
+        elif not history.first:
             return 0, at, history.columns()
-        if reads is None:
-            return None
-        start, first, stop = at, max(at - reads[0], 0), at + reads[1] + 1
-        if lasting:
+        elif isinstance(top, ir.Temporal) and top.op == "always" and not top.body.endless:
             first, stop = history.first, history.samples
-            start = max(start, first + reads[0])
+            start = max(at, first + past)
+        else:
+            return None
         if first < history.first or start >= history.samples or (first and self.compiled.grid.dt is None):
             return None
         return first, start - first, history.columns(first, stop)
-
-
-def _endless_always(rule: CompiledRequirement, formula: ir.Formula) -> bool:
-    """True if `formula` is an unbounded `always` of bounded windows, outside of planning windows."""
-    operator = formula.unbounded
-    return (
-        operator is not None
-        and operator.op == "always"
-        and not rule.windowed
-        and not any(part.endless for part in operator.operands)
-    )
-
-
-def _around(rule: CompiledRequirement, formula: ir.Formula, horizon: int | None) -> tuple[int, int] | None:
-    """Numbers of samples before and after an instant that determine a value; None if they are unbounded."""
-    window = window_of(rule, horizon)
-    if rule.absolute or (window is None and formula.endless and not _endless_always(rule, formula)):
-        return None
-    later = max((num.farthest.future for num in formula.numbers()), default=0)
-    return formula.history, max(formula.reach.future, window or 0) + later

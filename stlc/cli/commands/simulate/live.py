@@ -22,8 +22,7 @@ from stlc.controller.guard.candidates import SOURCES
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from stlc.controller.deployment.live import LiveMonitor
-    from stlc.monitor.online.margins import Margin
+    from stlc.controller.deployment.live import LiveMonitor, Margins
     from stlc.signature import Column
 
 REDRAWN = 0.5
@@ -161,7 +160,7 @@ class LiveView:
             found.append(text)
         return found
 
-    def _texts(self, margin: Margin, unit: str) -> tuple[str, str, str]:
+    def _texts(self, margin: Margins, unit: str) -> tuple[str, str, str]:
         """Return three texts about a requirement; `margin` is its robustness for each agent.
 
         The texts are the least robustness with its unit, the agent that has it, and the number of agents that

@@ -1,4 +1,4 @@
-"""Margins of traces side by side are those of an `Online` each, and of the traces so far, judged anew."""
+"""Margins at the latest sample are those of the trace so far, judged anew."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.instants import rule_bounds
-from stlc.monitor.online.margins import Margins
 from stlc.monitor.online.recompute import GrowingBounds
 from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
@@ -40,25 +39,23 @@ def monitor(formulas: list[str]) -> Monitor:
 
 @settings(deadline=None, max_examples=15)
 @given(names, st.integers(0, 2**32 - 1), st.integers(1, 14))
-def test_margins_are_those_of_monitors_side_by_side(formulas: list[str], seed: int, samples: int) -> None:
+def test_margins_are_those_of_the_trace_so_far(formulas: list[str], seed: int, samples: int) -> None:
     judge = monitor(formulas)
     compiled = judge.compiled
     data = np.random.default_rng(seed).uniform(-1, 1, (samples, 2, TRACES)).round(2)
-    margins = Margins(compiled.requirements, compiled.grid.horizon)
     alone = [judge.online() for _ in range(TRACES)]
     for k in range(samples):
-        margins.push({"x": data[k, 0], "y": data[k, 1]})
         for trace, online in enumerate(alone):
             online.push({"x": float(data[k, 0, trace]), "y": float(data[k, 1, trace])})
-        found = margins.evaluate()
         for rule in compiled.requirements:
-            for trace, online in enumerate(alone):
+            found = [online.margin(rule.name) for online in alone]
+            for margin, online in zip(found, alone, strict=True):
                 known = online.standing(rule.name)
-                assert found[rule.name].status(trace) == known.status
-                assert found[rule.name].violated[trace] == known.fails
+                assert margin.fails == known.fails
+                assert margin.open == known.instants - known.fails - known.holds
             low, high = anew(judge, rule, data[: k + 1])
-            assert np.array_equal(found[rule.name].low, low)
-            assert np.array_equal(found[rule.name].high, high)
+            assert [margin.low for margin in found] == low
+            assert [margin.high for margin in found] == high
 
 
 def anew(judge: Monitor, rule, data):  # type: ignore[no-untyped-def]
@@ -79,32 +76,22 @@ def test_looking_seldom_counts_the_same(often: int) -> None:
     judge = monitor(list(FORMULAS[:6]))
     compiled = judge.compiled
     data = np.random.default_rng(0).uniform(-1, 1, (150, 2, TRACES))
-    margins = Margins(compiled.requirements, compiled.grid.horizon)
-    for k, sample in enumerate(data):
-        margins.push({"x": sample[0], "y": sample[1]})
-        if k % often == often - 1:
-            margins.evaluate()
-    found = margins.evaluate()
+    alone = [judge.online() for _ in range(TRACES)]
+    for first in range(0, len(data), often):
+        for trace, online in enumerate(alone):
+            online.push_block(data[first : first + often, :, trace])
+            if often < 100:
+                online.margin("r0")
     for rule in compiled.requirements:
+        found = [online.margin(rule.name) for online in alone]
         low, high = anew(judge, rule, data)
-        assert np.array_equal(found[rule.name].low, low)
-        assert np.array_equal(found[rule.name].high, high)
+        assert [margin.low for margin in found] == low
+        assert [margin.high for margin in found] == high
         _, every = rule_bounds(rule, Record({"x": data[:, 0], "y": data[:, 1]}, NUMPY), range(150), 4, "open")
-        assert np.array_equal(found[rule.name].violated, (every < -TOLERANCE).sum(0))
+        assert [margin.fails for margin in found] == (every < -TOLERANCE).sum(0).tolist()
 
 
-def test_memory_is_bounded_by_the_windows() -> None:
-    compiled = monitor(["always[0, T] x > 0", "always[0, T] historically[0, 2 s] y > 0"]).compiled
-    margins = Margins(compiled.requirements, compiled.grid.horizon)
-    for _ in range(1000):
-        margins.push({"x": np.ones(2), "y": np.ones(2)})
-        margins.evaluate()
-    assert margins._history.samples == 1000
-    assert margins._history.samples - margins._history.first <= 128
-
-
-def test_a_requirement_of_nothing_has_margins() -> None:
-    compiled = Monitor("signal x\nrequire a: true", dt=1, horizon=4).compiled
-    margins = Margins(compiled.requirements, compiled.grid.horizon)
-    margins.push({"x": np.zeros(2)})
-    assert margins.evaluate()["a"].status(1) == "satisfied"
+def test_a_requirement_of_nothing_has_a_margin() -> None:
+    online = Monitor("signal x\nrequire a: true", dt=1, horizon=4).online()
+    online.push_block(np.zeros((1, 0)))
+    assert online.margin("a") == (np.inf, np.inf, 0, 0)
