@@ -340,7 +340,7 @@ static at run_before(const monitor *m, const node *o, const node *part, at from,
 }
 
 /* Pass on to the node `r` that its operand `p` is `truth` at the instants `first` to `last`, all of them new. */
-static void react(monitor *m, int32_t r, int32_t i, int32_t p, at first, at last, int truth) {
+INLINED void react(monitor *m, int32_t r, int32_t i, int32_t p, at first, at last, int truth) {
   const node *o = m->t->nodes + i, *part = m->t->nodes + p;
   const at n = m->s.known - 1;
   const int cut = m->of[r].cut, yes = o->flags & DUAL ? NO : YES;
@@ -361,7 +361,8 @@ static void react(monitor *m, int32_t r, int32_t i, int32_t p, at first, at last
       return;
     }
     join_runs(m, o, part, truth, &begin, &end);
-    mark(m, r, i, later(begin - o->lo, first - o->hi), sooner(end - o->hi, last - o->lo), truth);
+    if (end - begin >= o->hi - o->lo) /* else no window is all within the run */
+      mark(m, r, i, later(begin - o->lo, first - o->hi), sooner(end - o->hi, last - o->lo), truth);
     return;
   case PAST:
     if (truth == yes) {
@@ -389,7 +390,7 @@ static int unseen(const monitor *m, int32_t r, const node *o) {
 }
 
 /* Make the truth of a node known at instants at which it was not. */
-static void settle(monitor *m, int32_t r, int32_t i, at first, at last, int truth) {
+INLINED void settled(monitor *m, int32_t r, int32_t i, at first, at last, int truth) {
   const node *o = m->t->nodes + i;
   unsigned char *known = m->truths + o->truth;
   int32_t *skip = m->ints + o->skip;
@@ -410,6 +411,9 @@ static void settle(monitor *m, int32_t r, int32_t i, at first, at last, int trut
     else if (o->count == 2) from = since_when(m, m->t->nodes + in[0].node, truth);
     if (from && from - 1 <= last) ever(m, r, i, later(first, from - 1), truth);
   }
+}
+static void settle(monitor *m, int32_t r, int32_t i, at first, at last, int truth) {
+  settled(m, r, i, first, last, truth);
 }
 
 /* Truth of `until` or `since` at an instant, from those of its operands and its own at the next or last one. */
@@ -522,10 +526,11 @@ static void ever(monitor *m, int32_t r, int32_t i, at from, int truth) {
 static void begin(monitor *m, int32_t r, const graph *g) {
   const at n = m->s.known - 1;
   const int cut = m->of[r].cut;
-  for (int32_t i = g->first; i < g->first + g->count; ++i) {
-    const node *o = m->t->nodes + i;
+  const node *nodes = m->t->nodes + g->first, *end = nodes + g->count;
+  unsigned char *truths = m->truths;
+  for (const node *o = nodes; o < end; ++o) {
     if (o->kind == TRUTH) continue;
-    m->truths[o->truth + ((n + o->ahead) & o->truth_mask)] = 0;
+    truths[o->truth + ((n + o->ahead) & o->truth_mask)] = 0;
     if (o->kind == JOIN) m->ints[o->skip + ((n + o->ahead) & o->truth_mask)] = 0;
   }
   {
@@ -621,7 +626,7 @@ static void judged(monitor *m, int32_t r) {
   for (int32_t i = truths->first; i < truths->leaves; ++i) {
     const node *o = m->t->nodes + i;
     const int truth = n < o->delay ? 0 : truth_of(value_at(live, o, n - o->delay), of->slack);
-    if (truth) settle(m, r, i, n - o->delay, n - o->delay, truth);
+    if (truth) settled(m, r, i, n - o->delay, n - o->delay, truth);
   }
   if (of->cut) deciding = valued(m, truths, n, SAMPLE, 1, of->begin);
   value = deciding;

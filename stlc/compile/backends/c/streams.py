@@ -609,7 +609,7 @@ HEAD = """
 typedef REAL real;
 typedef int64_t at;
 #define INF ((real)INFINITY)
-#if defined(__GNUC__)
+#if defined(__GNUC__) && !defined(__OPTIMIZE_SIZE__)
 #define INLINED static inline __attribute__((always_inline))
 #else
 #define INLINED static inline
