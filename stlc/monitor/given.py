@@ -113,14 +113,25 @@ def _flat(name: str, values: Any) -> NDArray[Any]:
     return array
 
 
+def numbers_in(name: str, values: Any) -> NDArray[np.float64]:
+    """Return the array of the numbers in a list. Raises TraceError (E603) for other things in it."""
+    array = _flat(name, values)
+    if array.dtype.kind in "UcMm":
+        raise _refused(name, "holds other things than numbers where only numbers can be taken")
+    return array.astype(np.float64)
+
+
 def _of_objects(name: str, array: NDArray[Any]) -> NDArray[Any]:
     """Return the texts or numbers in an array of objects, such as a column of pandas."""
     missing = np.asarray(np.frompyfunc(_is_missing, 1, 1)(array), dtype=bool)
     there = array[~missing].tolist()
-    if all(isinstance(each, str) for each in there):
+    if there and all(isinstance(each, str) for each in there):
         return np.where(missing, "", array).astype(str)
     if all(isinstance(each, (bool, int, float, np.number, np.bool_)) for each in there):
-        return np.where(missing, np.nan, array).astype(np.float64)
+        try:
+            return np.where(missing, np.nan, array).astype(np.float64)
+        except OverflowError:
+            raise _refused(name, "holds an integer beyond the range of floats") from None
     raise _refused(name, f"holds Python objects (`{type(there[0]).__name__}`)")
 
 

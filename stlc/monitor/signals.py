@@ -26,7 +26,7 @@ from stlc.escape import shell, visible
 from stlc.grammar import ast
 from stlc.grammar.spec import Spec
 from stlc.monitor.cells import Cells
-from stlc.monitor.given import CLOCKS, UNNAMED, Given
+from stlc.monitor.given import CLOCKS, UNNAMED, Given, numbers_in
 from stlc.signature import Column, Kind
 from stlc.similar import closest
 from stlc.source import Span
@@ -336,7 +336,7 @@ def _find(data: Given, name: str) -> Any:
         if match is None or match["name"] not in data:
             return None
         name, index = match["name"], int(match["index"])
-    values = data[name] if hasattr(data[name], "shape") else np.asarray(data[name], dtype=np.float64)
+    values = data[name] if hasattr(data[name], "shape") else numbers_in(name, data[name])
     if index is None:
         return values
     return values[..., index] if values.ndim >= 2 and index < values.shape[-1] else None

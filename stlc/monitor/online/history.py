@@ -1,4 +1,4 @@
-"""Storage of growing time series (columns): rows are added at the end, dropped at the front."""
+"""Storage of growing time series (columns): samples are added at the end, dropped at the front."""
 
 from __future__ import annotations
 
@@ -10,14 +10,9 @@ from numpy.typing import NDArray
 
 Floats: TypeAlias = NDArray[np.float64]
 
-_SPARE = 64
-"""Rows that are free after the columns were moved."""
-
 
 class ColumnHistory:
-    """Storage of time series (columns) in arrays (rows, width) that grow by one row per sample.
-
-    Appending a row takes amortized constant time.
+    """Storage of the latest samples of time series (columns), which is joined when it is read.
 
     Attributes:
         first: index of the first stored sample.
@@ -25,28 +20,27 @@ class ColumnHistory:
     """
 
     def __init__(self) -> None:
-        self.first = self.samples = self._origin = 0
+        self.first = self.samples = 0
         self._names: tuple[str, ...] = ()
-        self._values = np.zeros((1, 0, 1))
+        self._blocks: list[Floats] = []
 
     def take(self, columns: Mapping[str, Floats]) -> None:
         """Append samples to all series; `columns` maps their names to arrays (count, width)."""
-        block, start = np.stack([*columns.values()]), self.samples - self._origin
-        signals, count, width = block.shape
-        if start + count > self._values.shape[1]:
-            kept = self.samples - self.first
-            moved = np.zeros((signals, 2 * (kept + count) + _SPARE, width))
-            moved[:, :kept] = self._values[:, start - kept : start]
-            self._names, self._values, self._origin, start = tuple(columns), moved, self.first, kept
-        self._values[:, start : start + count] = block
-        self.samples += count
+        self._names = tuple(columns)
+        self._blocks.append(np.stack([*columns.values()]))
+        self.samples += self._blocks[-1].shape[1]
 
     def columns(self, first: int = 0, stop: int | None = None) -> dict[str, Floats]:
-        """Return views of the stored rows of all series, from sample `first` to `stop` (exclusive)."""
-        low = max(first, self.first) - self._origin
-        high = (self.samples if stop is None else min(stop, self.samples)) - self._origin
-        return dict(zip(self._names, self._values[:, low:high], strict=True)) if self._names else {}
+        """Return views of the stored samples of all series, from sample `first` to `stop` (exclusive)."""
+        self.forget(0)
+        low = max(first, self.first) - self.first
+        high = (self.samples if stop is None else min(stop, self.samples)) - self.first
+        return dict(zip(self._names, self._blocks[0][:, low:high], strict=True)) if self._names else {}
 
     def forget(self, before: int) -> None:
-        """Drop the samples before sample `before`; their memory is freed at the next copy of the arrays."""
-        self.first = min(max(before, self.first), self.samples)
+        """Drop the samples before sample `before`."""
+        first = min(max(before, self.first), self.samples)
+        if self._names and (first > self.first or len(self._blocks) > 1):
+            joined = np.concatenate(self._blocks, axis=1)
+            self._blocks = [joined[:, first - self.first :]]
+        self.first = first

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
@@ -28,7 +27,6 @@ from stlc.trace import Trace
 Sample: TypeAlias = Mapping[str, Any]
 """Signal -> number; a vector is a list of them."""
 
-_BEYOND_FLOATS = 1 << 1023
 _ROWS = frozenset((list, tuple))
 _TRUTHS: tuple[Status, ...] = ("violated", "violated", "satisfied")
 """Verdict by the number of a truth in `streams.c`; 0 is none."""
@@ -172,17 +170,10 @@ class Online:
             pass
         if not isinstance(sample, Mapping):
             raise self._no_row() from None
-        huge = (k for k, each in sample.items() if isinstance(each, int) and abs(each) >= _BEYOND_FLOATS)
-        given = {name: [each] for name, each in {**sample, **dict.fromkeys(huge, math.inf)}.items()}
-        numbers = []
-        for need in self._needs:
-            laid = arrange(given, [need], plain=True)
-            if laid.samples != 1 or laid.shape:
-                message = f"`{need.column.name}` is one number of a sample, and several are given"
-                note = (f"needed by: {', '.join(need.by)}",)
-                raise TraceError.of("E605", message, need.span, note=note)
-            numbers.append(laid.env[need.column.name][0, 0])
-        return self.push_block([numbers])[0]
+        rows = self.rows({name: [value] for name, value in sample.items()})
+        if len(rows) != 1:
+            raise self._no_row()
+        return self.push_block(rows)[0]
 
     def _no_row(self) -> TraceError:
         message = f"a sample is one number for each of {', '.join(self.signals)}"

@@ -271,7 +271,7 @@ def test_samples_that_are_refused() -> None:
     online.push({"a": 1, "b": 2, "q": [0.0, 1.0], "more": "ignored"})
     with pytest.raises(StlcError, match="E601"):
         online.push({"q": [0.0, 0.0]})
-    with pytest.raises(StlcError, match=r"E605.*`a` is one number of a sample"):
+    with pytest.raises(StlcError, match=r"E605.*`a` has 2"):
         online.push({"a": [1.0, 2.0], "b": 0.0, "q": [0.0, 0.0]})
     assert online.samples == 1
 

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from stlc.diagnostics import TraceError
 from stlc.monitor.online.online import How
 from stlc.monitor.verdict import Monitor
 
@@ -71,7 +72,17 @@ def test_pieces_of_any_size() -> None:
         assert finished[name].instants == verdict[name].instants
 
 
-def test_numbers_beyond_floats_are_infinite() -> None:
+@pytest.mark.parametrize("value", [10**400, -(10**400), "high", [[1.0], [2.0, 3.0]]])
+def test_what_is_no_number_is_refused(value: object) -> None:
     online = monitor_of(["now"]).online()
-    online.push({"a": 10**400})
-    assert online.samples == 1
+    with pytest.raises(TraceError, match="E603"):
+        online.push({"a": value})
+    with pytest.raises(TraceError, match="E603"):
+        monitor_of(["now"]).check({"a": [value]})
+    assert online.samples == 0
+
+
+def test_none_is_an_unknown_number() -> None:
+    online = monitor_of(["now"]).online()
+    online.push({"a": None})
+    assert online.gaps["a"].samples == 1
