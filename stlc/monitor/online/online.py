@@ -281,8 +281,8 @@ class Online:
     def bounds(self, name: str, start: int) -> tuple[float, float]:
         """Least and greatest robustness of the requirement `name` at a start, over all continuations.
 
-        The value at the start is not final yet, or became so with the latest start that did, or the latest
-        sample decided the start. The bounds are computed by this call.
+        The value at the start is not final yet, or it is the latest that became final. The bounds are
+        computed by this call.
 
         Raises UsageError (U101) for another start.
         """
@@ -290,8 +290,7 @@ class Online:
         tally = watched.tally
         if tally.instants and start == tally.next - 1:
             return watched.counted
-        decided = isinstance(watched, Recomputed) and start in watched.news
-        if not decided and start not in watched.asked.starts(tally.next, self.samples):
+        if start not in watched.asked.starts(tally.next, self.samples):
             raise usage(f"`{name}` is not open at sample {start}")
         judged = watched.live(range(start, start + 1))
         return float(judged.low[0]), float(judged.high[0])
