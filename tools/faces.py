@@ -64,6 +64,12 @@ state signal x [m]
 state signal v [m/s]
 require marked: always[0 s, 0.3 s] x / 1 m - 0.3 * ind(v > 0.2) > -0.5
 """
+WALL = """spec cart
+state signal x [m]
+state signal v [m/s]
+@safety
+require inside: always[0 s, 0.4 s] x < 0.5
+"""
 STATES, RECORDINGS = 16, 6
 
 
@@ -74,7 +80,7 @@ def work() -> Path:
 
     folder = Path(tempfile.mkdtemp(dir=os.environ["PROBES"]))
     (folder / "cart.yaml").write_text(CART, encoding="utf-8")
-    for name, text in (("cart", SPEC), ("mission", MISSION), ("indicator", INDICATOR)):
+    for name, text in (("cart", SPEC), ("mission", MISSION), ("indicator", INDICATOR), ("wall", WALL)):
         (folder / f"{name}.stl").write_text(text, encoding="utf-8")
     for i in range(RECORDINGS):
         rows = recordings()[i]
@@ -232,21 +238,32 @@ def onnx_verdicts(spec: str = "cart") -> Any:
     return graphs(spec).judged(states(spec).numpy(), plans(spec).numpy())[0]
 
 
+def before_a_wall() -> dict[str, Any]:
+    """Specification -> states; before the wall no plan is safe for long, some for longer than others."""
+    return {"cart": states(), "wall": 0.1 * states("wall") + states("wall").new_tensor((0.28, 1.8))}
+
+
 def backup() -> list[Any]:
     """Decisions of the guard `paper`."""
     from stlc.controller.guard.kinds.paper import GUARD
     from stlc.controller.guard.search import StagedSearch
 
-    found = StagedSearch(run().task, run().policy, GUARD).search(states(), run().policy.plan(states()))
-    return [part.tolist() for part in (found.plans, found.source, found.prefix_length)]
+    said = []
+    for spec, x in before_a_wall().items():
+        found = StagedSearch(run(spec).task, run(spec).policy, GUARD).search(x, run(spec).policy.plan(x))
+        said.append([part.tolist() for part in (found.plans, found.source, found.prefix_length)])
+    return said
 
 
 def backup_program() -> list[Any]:
     """The same as a torch program."""
     from stlc.export.programs import Guarding
 
-    found = Guarding(run().task, run().network)(states(), run().policy.plan(states()))
-    return [part.tolist() for part in found]
+    said = []
+    for spec, x in before_a_wall().items():
+        found = Guarding(run(spec).task, run(spec).network)(x, run(spec).policy.plan(x))
+        said.append([part.tolist() for part in found])
+    return said
 
 
 def policy() -> list[Any]:
@@ -272,7 +289,12 @@ def backup_of_runtime() -> list[Any]:
     """Decisions of the runtime's backup policy."""
     from stlc.export.verify import backup_by_onnx
 
-    return of_answer(backup_by_onnx(graphs())(states()))
+    return [of_answer(backup_by_onnx(graphs(spec))(x)) for spec, x in before_a_wall().items()]
+
+
+def backup_of_header() -> list[Any]:
+    """Decisions of the backup policy in C."""
+    return [of_answer(header(spec)("backup")(x)) for spec, x in before_a_wall().items()]
 
 
 def cost() -> list[float]:
@@ -432,7 +454,7 @@ FACES: Mapping[str, Callable[[], Any]] = {
     "backup": backup,
     "backup as a torch program": backup_program,
     "backup by the runtime": backup_of_runtime,
-    "backup by the header": lambda: of_answer(header()("backup")(states())),
+    "backup by the header": backup_of_header,
     "indicator in check": lambda: documented("check indicator.stl {} --json"),
     "indicator in bounds": lambda: documented("check indicator.stl {} --uncertain x=0.01 --json"),
     "indicator by torch": lambda: torch_verdicts("indicator"),

@@ -69,6 +69,7 @@ INDICATORS = tuple(
 
 _LEVELS = "levels of a control in prefixes"
 _LENGTHS = "order of the lengths of prefixes"
+_LONGEST = "longest safe plan"
 ABS = """
         {},
         "{}",
@@ -234,6 +235,13 @@ PROBES = (
         BACKUPS,
     ),
     Probe(
+        _LONGEST,
+        "runtime/decision.py",
+        "samples = ops.sum(ops.number(satisfied(falls), falls))[0]",
+        "samples = -ops.sum(ops.number(satisfied(falls), falls))[0]",
+        BACKUPS,
+    ),
+    Probe(
         "title of a guard",
         "controller/guard/kinds/paper.py",
         'title="paper\'s guard"',
@@ -288,6 +296,7 @@ APART: Mapping[tuple[str, str], str] = {
     ),
     (_LEVELS, "backup by the header"): _BACKUP,
     (_LENGTHS, "backup by the header"): _BACKUP,
+    (_LONGEST, "backup by the header"): _IN_C,
 }
 """Meaning and face -> the test that holds the face to the meaning."""
 
