@@ -316,7 +316,7 @@ class Online:
     def _standing(self, watched: Watched) -> RequirementSummary:
         tally = watched.tally
         starts = watched.asked.starts(tally.next, self.samples)
-        return tally.with_more(watched.live(starts)) if starts else tally
+        return tally.with_more(watched.live(starts))
 
     @property
     def in_scope(self) -> bool | None:
@@ -350,7 +350,7 @@ class Online:
         """Summary of a requirement if the trace ends now."""
         starts, tally = self._starts(watched), watched.tally
         rest = range(min(tally.next, starts.stop), starts.stop)
-        return tally.with_more(watched.ended(rest)) if rest else tally
+        return tally.with_more(watched.ended(rest))
 
     def _worst(self, watched: Watched) -> RequirementSummary | None:
         """Summary of a requirement if the trace ended now; None if it would not be violated."""
