@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.schedule import PICKS
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 
@@ -75,13 +76,40 @@ def prefix_robustness(formulas: Sequence[ir.Formula], columns: Mapping[str, Tens
         the bound. Without formulas, all entries are +inf.
     """
     like = next(iter(columns.values()))
-    steps, batch = like.shape
-    if not formulas:
-        return torch.full_like(like, torch.inf)
-    index = torch.arange(steps, device=like.device)
-    beyond = torch.where(index[:, None] > index[None], 1.0, -1.0).to(like.dtype)
+    bounds = [prefix_bounds(anchored(formula), columns) for formula in formulas]
+    return torch.stack(bounds).amin(0) if bounds else torch.full_like(like, torch.inf)
+
+
+def copied(formula: ir.Formula) -> bool:
+    """True if `prefix_bounds` evaluates a copy of the trace for each of its prefixes."""
+    match formula:
+        case ir.BoolOp(_, items):
+            return any(map(copied, items))
+        case ir.Temporal("always", _, body):
+            return not all(isinstance(node, (ir.Predicate, ir.BoolOp, ir.Truth)) for node in body.walk())
+        case _:
+            return not isinstance(formula, ir.Predicate)
+
+
+def prefix_bounds(formula: ir.Formula, columns: Mapping[str, Tensor]) -> Tensor:
+    """`prefix_robustness` of one formula: (time, batch).
+
+    An `always` over states is a running minimum. Of any other operator, each prefix is evaluated.
+    """
+    steps, batch = next(iter(columns.values())).shape
+    match formula:
+        case ir.BoolOp(op, items) if not copied(formula):
+            return TORCH.join([prefix_bounds(item, columns) for item in items], PICKS[op])
+        case ir.Temporal("always", window, body) if not copied(formula):
+            last = min(steps - 1 if window.hi is None else window.hi, steps - 1)
+            there = range(window.lo, last + 1)
+            (values,) = evaluate([body], columns, ops=TORCH, start=there.start, count=len(there))
+            least = values.cummin(0).values
+            before = torch.full_like(least[:1], torch.inf).expand(window.lo, -1)
+            return torch.cat((before, least, least[-1:].expand(steps - 1 - last, -1)))
+    index = torch.arange(steps, device=next(iter(columns.values())).device)
+    beyond = torch.where(index[:, None] > index[None], 1.0, -1.0)
     env = {name: column.repeat(1, steps) for name, column in columns.items()}
-    env[BEYOND] = beyond.repeat_interleave(batch, 1)
-    opened = [open_ended(anchored(formula)) for formula in formulas]
-    margins = evaluate(opened, env, ops=TORCH)
-    return torch.stack([margin[0].expand(steps * batch) for margin in margins]).amin(0).view(steps, batch)
+    env[BEYOND] = beyond.to(next(iter(columns.values())).dtype).repeat_interleave(batch, 1)
+    (margin,) = evaluate([open_ended(formula)], env, ops=TORCH)
+    return margin[0].expand(steps * batch).view(steps, batch)

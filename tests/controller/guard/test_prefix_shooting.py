@@ -14,10 +14,11 @@ from torch import Tensor
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.controller.guard.candidates import Limits, finite, first, grid_of
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
-from stlc.controller.guard.safe_prefix import prefix_robustness
+from stlc.controller.guard.safe_prefix import copied, prefix_robustness
 from stlc.controller.guard.search import StagedSearch
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
+from stlc.monitor.verdict import Monitor
 from stlc.runtime.decision import best
 from stlc.runtime.prefixes import PrefixGrid
 
@@ -236,6 +237,27 @@ def test_prefix_robustness_is_the_bound_over_continuations(car_task: Task, seed:
 def _torch() -> object:
 
     return TORCH
+
+
+@pytest.mark.parametrize(
+    "formula",
+    [
+        "always[0, 0.5 s] x > 0",
+        "always[0.2 s, 0.3 s] (x > 0 or y < 0) and x < 3",
+        "always x > -1",
+        "y > 0 -> always[0.1 s, 0.4 s] x > 0",
+        "always[0, 0.4 s] (x > 0 and next(y) < 0)",
+        "always[0, 0.3 s] eventually[0, 0.2 s] x > 0",
+    ],
+)
+def test_running_minima_are_the_bounds_of_all_prefixes(formula: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    rule = Monitor(f"signal x, y\nrequire r: {formula}", dt=0.1).compiled.requirements[0]
+    generator = torch.Generator().manual_seed(0)
+    columns = {name: torch.randn(7, 40, generator=generator, dtype=F64) for name in "xy"}
+    found = prefix_robustness([rule.formula], columns)
+    assert copied(rule.formula) == ("eventually" in formula)
+    monkeypatch.setattr("stlc.controller.guard.safe_prefix.copied", lambda _: True)
+    assert torch.equal(found, prefix_robustness([rule.formula], columns))
 
 
 def test_without_safety_requirements_every_prefix_is_safe() -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.controller.guard.candidates import SAFEST, Candidates, Deadline, first
-from stlc.controller.guard.safe_prefix import prefix_robustness
+from stlc.controller.guard.safe_prefix import anchored, copied, prefix_robustness
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup, Tried
 from stlc.controller.guard.stages.prefix_shooting import PrefixShooting
 from stlc.runtime.decision import longest
@@ -31,9 +31,11 @@ class LongestSafePrefix(GuardStage):
     """
 
     def __init__(self, setup: Setup) -> None:
-        self.task, self.batch = setup.task, setup.grid.batch
+        self.task = setup.task
         self._formulas = [rule.formula for rule in setup.task.compiled.safety]
         self._shooting = PrefixShooting(setup)
+        copies = self.task.horizon if any(copied(anchored(formula)) for formula in self._formulas) else 1
+        self._size = max(setup.grid.batch // copies, 1)
 
     def wanted(self, best: Candidates) -> Tensor:
         """Mask of the agents without a safe plan."""
@@ -70,15 +72,12 @@ class LongestSafePrefix(GuardStage):
     def _safest(self, x: Tensor, candidates: Candidates) -> Candidates:
         agents, choices = candidates.rho.shape
         starts, plans = x.repeat_interleave(choices, 0), candidates.plans.flatten(0, 1)
-        size = max(self.batch // self.task.horizon, 1)  # every prefix is a trajectory of its own
-        fallen = torch.cat(
-            [
-                prefix_robustness(self._formulas, self.task.system.rollout_columns(start, plan))
-                for start, plan in zip(torch.split(starts, size), torch.split(plans, size), strict=True)
-            ],
-            1,
-        )
-        falls = fallen.view(-1, agents, choices).transpose(1, 2)
+        fallen = []
+        for some, theirs in zip(torch.split(starts, self._size), torch.split(plans, self._size), strict=True):
+            states = self.task.rollout(some, theirs).permute(2, 1, 0).contiguous()
+            columns = dict(zip(self.task.system.names, states, strict=True))
+            fallen.append(prefix_robustness(self._formulas, columns))
+        falls = torch.cat(fallen, 1).view(-1, agents, choices).transpose(1, 2)
         chosen = candidates.pick(first(longest(falls, candidates.rho.t(), candidates.cost.t(), TORCH)))
         return replace(chosen, source=torch.full_like(chosen.source, SAFEST))
 
