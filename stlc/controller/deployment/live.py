@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.semantics.tolerance import StatusInScope, status_of
+from stlc.compile.semantics.tolerance import TOLERANCE, StatusInScope
 from stlc.controller.guard.candidates import SOURCES
 from stlc.jsontext import Count, Num
 from stlc.monitor.online.online import Online
@@ -36,7 +36,7 @@ class Margins:
 
     def status(self, agent: int) -> StatusInScope:
         """Violated if the agent violated it at any start, satisfied if it did at none and none is open."""
-        return status_of(bool(self.violated[agent]), not self.open[agent])
+        return TOLERANCE.status(bool(self.violated[agent]), not self.open[agent])
 
 
 @dataclass(frozen=True, slots=True)

@@ -99,7 +99,8 @@ def prefix_bounds(formula: ir.Formula, columns: Mapping[str, Tensor]) -> Tensor:
     steps, batch = next(iter(columns.values())).shape
     match formula:
         case ir.BoolOp(op, items) if not copied(formula):
-            return TORCH.join([prefix_bounds(item, columns) for item in items], PICKS[op])
+            joined: Tensor = TORCH.join([prefix_bounds(item, columns) for item in items], PICKS[op])
+            return joined
         case ir.Temporal("always", window, body) if not copied(formula):
             last = min(steps - 1 if window.hi is None else window.hi, steps - 1)
             there = range(window.lo, last + 1)
@@ -112,4 +113,5 @@ def prefix_bounds(formula: ir.Formula, columns: Mapping[str, Tensor]) -> Tensor:
     env = {name: column.repeat(1, steps) for name, column in columns.items()}
     env[BEYOND] = beyond.to(next(iter(columns.values())).dtype).repeat_interleave(batch, 1)
     (margin,) = evaluate([open_ended(formula)], env, ops=TORCH)
-    return margin[0].expand(steps * batch).view(steps, batch)
+    bounds: Tensor = margin[0].expand(steps * batch).view(steps, batch)
+    return bounds
