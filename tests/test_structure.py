@@ -10,8 +10,8 @@ from helpers.tools import ROOT, load_tool
 
 structure = load_tool("structure")
 
-NODES = 461176
-CROSSINGS = 4.40
+NODES = 462430
+CROSSINGS = 4.39
 CIRCLES: set[tuple[str, str]] = set()
 IMPLEMENTATIONS = {
     "numbers of one step": 5,
