@@ -145,7 +145,7 @@ PROBES = (
     ),
     Probe(
         "implication",
-        "compile/ir/normal_form.py",
+        "compile/ir/typed.py",
         "return Connective(dual, (((items[0], inverse),), ((items[1], sign),)))",
         "return Connective(dual, (((items[0], sign),), ((items[1], sign),)))",
         (*RECORDED, "stream in C", *PLANNED, "plan by milp", "bounds"),

@@ -444,8 +444,7 @@ class Formula(Node, FormulaTree["Formula"]):
         """Latest of the first samples of all future windows: after now, and after the first sample.
 
         If the trace ends before that sample, some operand of the formula has no value, wherever windows are
-        cut. The second number is that of operators such as `always@[a, b]`, which count from the first
-        sample.
+        cut. The second number is that of operators such as `always@[a, b]`.
         """
         return self.fold(EARLIEST)
 
