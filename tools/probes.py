@@ -237,8 +237,8 @@ PROBES = (
     Probe(
         _LONGEST,
         "runtime/decision.py",
-        "samples = ops.sum(ops.number(satisfied(falls), falls))[0]",
-        "samples = -ops.sum(ops.number(satisfied(falls), falls))[0]",
+        "samples = ops.sum(ops.number(TOLERANCE.satisfied(falls), falls))[0]",
+        "samples = -ops.sum(ops.number(TOLERANCE.satisfied(falls), falls))[0]",
         BACKUPS,
     ),
     Probe(
