@@ -119,10 +119,11 @@ class Online:
         self._history = ColumnHistory()
         asked = self.asked + [self._ask(rule, once=True) for rule in compiled.assumptions]
         self._kernel, watched = self._watch(asked)
-        self._watched, self._scope = watched[: len(rules)], watched[len(rules) :]
-        self.requirements = tuple(rule.name for rule in rules)
+        self._watched = {rule.name: each for rule, each in zip(rules, watched, strict=False)}
+        self._scope = watched[len(rules) :]
+        self.requirements = tuple(self._watched)
         """Names of the requirements, in order."""
-        self._streamed = [each.asked.rule.name for each in self._watched if isinstance(each, Streamed)]
+        self._streamed = [name for name, each in self._watched.items() if isinstance(each, Streamed)]
         self._step = None if compiled.grid.dt is None else float(compiled.grid.dt)
         self._recomputed = [each for each in watched if isinstance(each, Recomputed)]
         self._gaps: dict[str, Gap] = {}
@@ -211,8 +212,9 @@ class Online:
         if self._buffer is not None:
             self._buffer.take(columns)
             if self._buffer.full:
-                found = [(watched.asked.rule, self._worst(watched)) for watched in self._watched]
-                self._buffer.forget([(rule, worst) for rule, worst in found if worst is not None])
+                for name in self.requirements:
+                    self.cause(name)
+                self._buffer.forget()
         return decided, taken
 
     def feed(self, signals: Mapping[str, Any] | Trace) -> int:
@@ -233,18 +235,15 @@ class Online:
 
     def verdicts(self) -> tuple[Decision, ...]:
         """Verdicts that the latest sample decided, in the order of the requirements."""
-        found: list[Decision] = []
-        names, sample = self._streamed, self.samples - 1
-        if self._kernel is not None:
-            for number, start, truth in self._kernel.news():
-                if number < len(names):  # no assumption
-                    found.append(Decision(names[number], start, self.time(start), _TRUTHS[truth], sample))
+        names, news = self._streamed, [] if self._kernel is None else self._kernel.news()
+        found = [(names[rule], start, _TRUTHS[truth]) for rule, start, truth in news if rule < len(names)]
+        for name, watched in self._watched.items() if self._recomputed else ():
+            if isinstance(watched, Recomputed):
+                found += [(name, start, status) for start, status in watched.news.items()]
         if self._recomputed:
-            for name, watched in zip(self.requirements, self._watched, strict=True):
-                news = watched.news.items() if isinstance(watched, Recomputed) else ()
-                found += [Decision(name, start, self.time(start), status, sample) for start, status in news]
-            found.sort(key=lambda each: self.requirements.index(each.requirement))
-        return tuple(found)
+            found.sort(key=lambda each: self.requirements.index(each[0]))
+        sample = self.samples - 1
+        return tuple(Decision(name, start, self.time(start), status, sample) for name, start, status in found)
 
     @property
     def gaps(self) -> dict[str, Gap]:
@@ -338,10 +337,11 @@ class Online:
             raise TraceError.of("E605", "there are no samples")
         if self.how.end == "strict":
             grid = self.compiled.grid
-            found = (check_length(w.asked.rule, self.samples, self._starts(w), grid) for w in self._watched)
+            watched = self._watched.values()
+            found = (check_length(w.asked.rule, self.samples, self._starts(w), grid) for w in watched)
             if refused := [*filter(None, found)]:
                 raise TraceError(*refused)
-        return {watched.asked.rule.name: self._ended(watched) for watched in self._watched}
+        return {name: self._ended(watched) for name, watched in self._watched.items()}
 
     def _starts(self, watched: Watched) -> range:
         return starts_of(watched.asked.rule, self.samples, self.compiled.grid.horizon, self.how.at)
@@ -352,13 +352,6 @@ class Online:
         rest = range(min(tally.next, starts.stop), starts.stop)
         return tally.with_more(watched.ended(rest))
 
-    def _worst(self, watched: Watched) -> RequirementSummary | None:
-        """Summary of a requirement if the trace ended now; None if it would not be violated."""
-        if not self.samples or (isinstance(self.how.at, int) and self.how.at >= self.samples):
-            return None
-        tally = self._ended(watched)
-        return tally if tally.fails else None
-
     def cause(self, name: str) -> Cause | None:
         """Return the cause of the worst violation of a requirement up to now.
 
@@ -367,11 +360,12 @@ class Online:
         numbers. Before it drops samples, it finds and stores the causes of the worst violations that these
         samples show.
         """
-        watched = self._find(name)
-        if self._buffer is None or (worst := self._worst(watched)) is None:
+        watched, at = self._find(name), self.how.at
+        if self._buffer is None or self.samples <= (at if isinstance(at, int) else 0):
             return None
-        return self._buffer.cause(watched.asked.rule, worst)
+        worst = self._ended(watched)
+        return self._buffer.cause(watched.asked.rule, worst) if worst.fails else None
 
     def _find(self, name: str) -> Watched:
         require_known([name], self.requirements)
-        return self._watched[self.requirements.index(name)]
+        return self._watched[name]

@@ -5,7 +5,7 @@ The cause of a violation is found and stored before the samples that show it are
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -37,7 +37,7 @@ class TraceBuffer:
     compiled: Compiled
     t0: float
     _history: ColumnHistory = field(default_factory=ColumnHistory)
-    _found: dict[tuple[str, int, float], Cause] = field(default_factory=dict)
+    _found: dict[str, dict[tuple[int, float], Cause]] = field(default_factory=dict)
     _width: int = 1
 
     def take(self, columns: Mapping[str, Floats]) -> None:
@@ -50,19 +50,17 @@ class TraceBuffer:
         """True if the buffer is full, so that `forget` must be called."""
         return (self._history.samples - self._history.first) * self._width > 2 * _MOST
 
-    def forget(self, violations: Iterable[tuple[CompiledRequirement, RequirementSummary]]) -> None:
-        """Drop the older half of the samples; the causes of `violations` are found and stored before."""
-        for rule, worst in violations:
-            if cause := self.cause(rule, worst):
-                self._found[rule.name, worst.high_at, worst.high] = cause
+    def forget(self) -> None:
+        """Drop the older half of the samples; the causes that they show have been found before."""
         self._history.forget(self._history.samples - _MOST // self._width)
 
     def cause(self, rule: CompiledRequirement, worst: RequirementSummary) -> Cause | None:
         """Return the cause of the worst violation of the requirement `rule`, at the instant `worst.high_at`.
 
-        None if the samples that show the violation were dropped before `forget` stored the cause.
+        None if the samples that show the violation were dropped before the cause was found.
         """
-        if known := self._found.get((rule.name, worst.high_at, worst.high)):
+        key = worst.high_at, worst.high
+        if known := self._found.get(rule.name, {}).get(key):
             return known
         excerpt = self._excerpt(rule, worst.high_at)
         if excerpt is None:
@@ -83,7 +81,9 @@ class TraceBuffer:
         sample = first + cause.sample
         time = float(sample) if step is None else self.t0 + sample * step
         violated = first + cause.violated
-        return replace(cause, start=worst.high_at, sample=sample, time=time, violated=violated, first=first)
+        found = replace(cause, start=worst.high_at, sample=sample, time=time, violated=violated, first=first)
+        self._found[rule.name] = {key: found}
+        return found
 
     def _excerpt(self, rule: CompiledRequirement, at: int) -> tuple[int, int, dict[str, Floats]] | None:
         """Return (first sample, instant to explain, signals) of an excerpt that explains a violation at `at`.

@@ -129,7 +129,7 @@ def test_without_a_compiler_a_stream_is_evaluated_anew(written, trace, end) -> N
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(native, "load", lambda _: None)
         online = check_stream(formula, trace, How(at, end))
-    assert isinstance(online._watched[0], Recomputed)
+    assert isinstance(online._find(online.requirements[0]), Recomputed)
 
 
 @pytest.mark.parametrize("every", [False, True])
@@ -160,7 +160,7 @@ OPERATORS = {
 @pytest.mark.parametrize("name", OPERATORS)
 def test_every_operator_has_transducers(name: str) -> None:
     text = "signal x\nsignal y\nsignal z\nrequire r: " + OPERATORS[name]
-    (watched,) = Monitor(text, dt=1.0).online()._watched
+    (watched,) = Monitor(text, dt=1.0).online()._watched.values()
     assert isinstance(watched, Streamed)
 
 
@@ -179,7 +179,7 @@ def test_wide_windows_are_never_late() -> None:
 
 
 def test_windows_of_more_samples_than_memory_holds_are_evaluated_anew() -> None:
-    (watched,) = Monitor("signal x\nrequire r: always[0 s, 1e10 s] x > 0", dt=1.0).online()._watched
+    (watched,) = Monitor("signal x\nrequire r: always[0 s, 1e10 s] x > 0", dt=1.0).online()._watched.values()
     assert isinstance(watched, Recomputed)
 
 
