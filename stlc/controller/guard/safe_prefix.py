@@ -94,7 +94,8 @@ def copied(formula: ir.Formula) -> bool:
 def prefix_bounds(formula: ir.Formula, columns: Mapping[str, Tensor]) -> Tensor:
     """`prefix_robustness` of one formula: (time, batch).
 
-    An `always` over states is a running minimum. Of any other operator, each prefix is evaluated.
+    An `always` over states is a running minimum. Of any other operator, each prefix is evaluated. A value
+    that is no number makes all entries no number, as in exported controllers.
     """
     steps, batch = next(iter(columns.values())).shape
     match formula:
@@ -107,7 +108,8 @@ def prefix_bounds(formula: ir.Formula, columns: Mapping[str, Tensor]) -> Tensor:
             (values,) = evaluate([body], columns, ops=TORCH, start=there.start, count=len(there))
             least = values.cummin(0).values
             before = torch.full_like(least[:1], torch.inf).expand(window.lo, -1)
-            return torch.cat((before, least, least[-1:].expand(steps - 1 - last, -1)))
+            whole = torch.cat((before, least, least[-1:].expand(steps - 1 - last, -1)))
+            return torch.where(values.isnan().any(0), torch.nan, whole)
     index = torch.arange(steps, device=next(iter(columns.values())).device)
     beyond = torch.where(index[:, None] > index[None], 1.0, -1.0)
     env = {name: column.repeat(1, steps) for name, column in columns.items()}

@@ -254,10 +254,13 @@ def test_running_minima_are_the_bounds_of_all_prefixes(formula: str, monkeypatch
     rule = Monitor(f"signal x, y\nrequire r: {formula}", dt=0.1).compiled.requirements[0]
     generator = torch.Generator().manual_seed(0)
     columns = {name: torch.randn(7, 40, generator=generator, dtype=F64) for name in "xy"}
+    columns["x"][4, ::9] = torch.nan
     found = prefix_robustness([rule.formula], columns)
     assert copied(rule.formula) == ("eventually" in formula)
     monkeypatch.setattr("stlc.controller.guard.safe_prefix.copied", lambda _: True)
-    assert torch.equal(found, prefix_robustness([rule.formula], columns))
+    torch.testing.assert_close(
+        found, prefix_robustness([rule.formula], columns), rtol=0, atol=0, equal_nan=True
+    )
 
 
 def test_without_safety_requirements_every_prefix_is_safe() -> None:
