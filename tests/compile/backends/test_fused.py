@@ -68,7 +68,7 @@ def test_nan_wins_as_in_numpy() -> None:
     np.testing.assert_array_equal(found[0], expected[0])
 
 
-@pytest.mark.parametrize("kind", ["read only", "gaps", "float32"])
+@pytest.mark.parametrize("kind", ["read only", "gaps", "float32", "big-endian"])
 def test_arrays_that_c_cannot_read_are_numpys(kind: str) -> None:
     rule = Monitor("signal x, y\nrequire r: x > y", dt=1.0).compiled.requirements[0]
     plan = signal_plan((rule.formula,), 4, range(4), "truncate").plan
@@ -76,12 +76,22 @@ def test_arrays_that_c_cannot_read_are_numpys(kind: str) -> None:
         "read only": np.ones((4, 1)),
         "gaps": np.ones((4, 2))[:, :1],
         "float32": np.ones((4, 1), np.float32),
+        "big-endian": np.ones((4, 1), ">f8"),
     }[kind]
     x.flags.writeable = kind != "read only"
     env = {"x": x, "y": np.zeros((4, 1))}
     assert plan._fused is not None
     assert plan._fused.run(env) is None
     assert plan.roots(env)[0].tolist() == [[1.0]] * 4
+
+
+def test_arrays_without_traces_and_of_other_lengths_are_numpys() -> None:
+    rule = Monitor("signal x\nrequire r: x > 0", dt=1.0).compiled.requirements[0]
+    plan = signal_plan((rule.formula,), 4, range(4), "truncate").plan
+    assert plan._fused is not None
+    assert plan._fused.run({"x": np.ones((4, 0))}) is None
+    assert plan._fused.run({"y": np.ones((4, 1)), "x": np.ones((3, 1))}) is None
+    assert plan.roots({"x": np.ones((4, 0))})[0].shape == (4, 0)
 
 
 def test_long_traces_and_many_are_numpys() -> None:

@@ -67,13 +67,13 @@ class Fused:
             MemoryError: working memory cannot be allocated.
         """
         library, held = kernel_library("float64"), [env[name] for name in self.columns]
-        shape = held[0].shape
-        if library is None or any(x.shape != shape or x.dtype.char != "d" for x in held):
+        shape = next(iter(env.values())).shape  # what the plan was made for
+        if library is None or any(x.shape != shape or x.dtype != np.float64 for x in held):
             return None
         out = np.empty((self.roots[-1].stop, *shape[1:]))
         try:
             places = [ctypes.addressof(_BYTE.from_buffer(x)) for x in (out, *held)]
-        except (TypeError, BufferError):  # an array that is read only, or has gaps
+        except (TypeError, ValueError, BufferError):  # an array that is read only, has gaps, or is empty
             return None
         bases = (ctypes.c_void_p * (len(places) + 1))(None, *places)
         steps, traces = len(self.code) // _STEP.size, math.prod(shape[1:])
