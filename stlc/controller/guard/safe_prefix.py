@@ -94,11 +94,16 @@ def copied(formula: ir.Formula) -> bool:
 def prefix_bounds(formula: ir.Formula, columns: Mapping[str, Tensor]) -> Tensor:
     """`prefix_robustness` of one formula: (time, batch).
 
-    An `always` over states is a running minimum. Of any other operator, each prefix is evaluated. A value
-    that is no number makes all entries no number, as in exported controllers.
+    An `always` over states is a running minimum, and a predicate is known from the first sample on. Of any
+    other operator, each prefix is evaluated. A value that is no number makes all entries no number, as in
+    exported controllers.
     """
     steps, batch = next(iter(columns.values())).shape
     match formula:
+        case ir.Predicate():
+            (value,) = evaluate([formula], columns, ops=TORCH)
+            first: Tensor = value.expand(steps, batch)
+            return first
         case ir.BoolOp(op, items) if not copied(formula):
             joined: Tensor = TORCH.join([prefix_bounds(item, columns) for item in items], PICKS[op])
             return joined

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.controller.guard.candidates import Limits, finite, first, grid_of
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
@@ -261,6 +262,20 @@ def test_running_minima_are_the_bounds_of_all_prefixes(formula: str, monkeypatch
     torch.testing.assert_close(
         found, prefix_robustness([rule.formula], columns), rtol=0, atol=0, equal_nan=True
     )
+
+
+def test_a_predicate_on_the_initial_state_is_evaluated_on_no_copies(monkeypatch: pytest.MonkeyPatch) -> None:
+    rule = Monitor("signal x, y\nrequire r: y > 0 -> always x > 0", dt=0.1).compiled.requirements[0]
+    widths = []
+
+    def watched(formulas: object, columns: Mapping[str, torch.Tensor], **named: object) -> object:
+        widths.append(columns["x"].shape[1])
+        return evaluate(formulas, columns, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("stlc.controller.guard.safe_prefix.evaluate", watched)
+    prefix_robustness([rule.formula], {name: torch.ones(7, 4, dtype=F64) for name in "xy"})
+    assert not copied(rule.formula)
+    assert set(widths) == {4}
 
 
 def test_without_safety_requirements_every_prefix_is_safe() -> None:
