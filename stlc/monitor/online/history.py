@@ -10,9 +10,14 @@ from numpy.typing import NDArray
 
 Floats: TypeAlias = NDArray[np.float64]
 
+_FEW = 64
+"""Blocks of samples that are not joined, and samples per further block."""
+
 
 class ColumnHistory:
     """Storage of the latest samples of time series (columns), which is joined when it is read.
+
+    It is also joined when there are many blocks, whose headers would take more memory than their numbers.
 
     Attributes:
         first: index of the first stored sample.
@@ -29,6 +34,8 @@ class ColumnHistory:
         self._names = tuple(columns)
         self._blocks.append(np.stack([*columns.values()]))
         self.samples += self._blocks[-1].shape[1]
+        if len(self._blocks) > _FEW + (self.samples - self.first) // _FEW:
+            self.forget(0)
 
     def columns(self, first: int = 0, stop: int | None = None) -> dict[str, Floats]:
         """Return views of the stored samples of all series, from sample `first` to `stop` (exclusive)."""

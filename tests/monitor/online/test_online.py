@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import StlcError, UsageError
+from stlc.monitor.online.history import ColumnHistory
 from stlc.monitor.online.online import How
 from stlc.monitor.prefix_bounds import FAR, lengthened, prefix_bound, with_seen
 from stlc.monitor.values import Record
@@ -229,6 +230,15 @@ def test_memory_does_not_grow(samples: int) -> None:
     assert grown(push, samples) < 4_000
     assert online.standing("r_bounded").instants == samples
     assert grown(kept.append, 700) > 4_000
+
+
+def test_samples_that_come_one_by_one_are_stored_in_few_arrays() -> None:
+    history = ColumnHistory()
+    for sample in range(5_000):
+        history.take({"x": np.full((1, 1), float(sample))})
+    assert len(history._blocks) < 200
+    history.forget(1_000)
+    assert history.columns(2_000)["x"].ravel().tolist() == list(range(2_000, 5_000))
 
 
 def test_open_starts_and_standing() -> None:
