@@ -260,7 +260,7 @@ class RunDir:
         return Path(folder.shown) / RunDir.TRACE
 
     def remove(self) -> None:
-        """Delete the folder; links `latest` to it are redirected to the newest remaining self.
+        """Delete the folder; links `latest` to it are redirected to the newest remaining run.
 
         Raises:
             MissingError: R201, the folder cannot be deleted.
