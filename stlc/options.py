@@ -1,7 +1,7 @@
 """Options of operations, declared once: a function's arguments and a command's options come from them.
 
-The options of an operation are the fields of a dataclass, each annotated with an `Option`. `taking` makes
-them the keyword arguments of the function, and `stlc.cli.framework.program` those of the command line.
+The options of an operation are the fields of a dataclass, each annotated with an `Option`. `Options.taking`
+makes them the keyword arguments of the function, and `stlc.cli.framework.program` those of the command line.
 """
 
 from __future__ import annotations

@@ -47,8 +47,8 @@ class Spec(ast.Node):
         imports: imports, in order.
         items: declarations, in order.
         source: the source text.
-        library: key of an imported file -> its text. A trace, for
-            example, stores such texts. If None, the files are read from disk.
+        library: key of an imported file -> its text. A trace, for example, stores such texts. If None, the
+            files are read from disk.
     """
 
     name: str

@@ -46,7 +46,7 @@ class Time:
 class DelayedSignal(ir.ShiftedSignal):
     """Signal shifted by a time, as in `shift(x, 0.1 s)`, in addition to `steps` samples.
 
-    `stlc.compile.ir.discretize.in_samples` converts the time to samples on the grid.
+    `stlc.compile.ir.discretize.Grid.in_samples` converts the time to samples on the grid.
     """
 
     delay: Time = field(default_factory=Time)

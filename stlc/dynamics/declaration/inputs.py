@@ -304,7 +304,7 @@ def _sampled(decl: InputDecl, entry: Entry, cx: Context) -> Sampled:
 
 
 def _draws(decl: InputDecl) -> tuple[Assign, ...]:
-    """Return the distributions of the numbers of an input signal, as `drawn_numbers` has them."""
+    """Return the distributions of the numbers of an input signal, as `InputDecl.drawn` has them."""
     low, high = ir.Const(decl.low), ir.Const(decl.high)
     found = [
         Assign(name, ir.Op("uniform", (low, high)), f"uniform({decl.low:g}, {decl.high:g})")
