@@ -57,7 +57,7 @@ class Landmarks:
         def open_to(formula: ir.Formula) -> ir.Formula:
             return ir.Truth(False) if any(self._excludes(one, formula) for one in left) else formula
 
-        left.extend(each.map_terms(open_to) for each in rest)
+        left += [each.map_terms(open_to) for each in rest]
         return ir.BoolOp.joined("and", before), ir.BoolOp.joined("and", left)
 
     def _excludes(self, literal: ir.Formula, formula: ir.Formula) -> bool:

@@ -6,9 +6,12 @@ from pathlib import Path
 
 import pytest
 
+from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.text import show_formula
 from stlc.controller.problem.task import Task
+from stlc.controller.search.sequences.landmarks import Landmarks
 from stlc.controller.search.sequences.sequences import Sequences
+from stlc.signature import Column
 
 MISSIONS = Path(__file__).parents[3] / "data/sequences"
 
@@ -32,3 +35,11 @@ def test_only_the_floor_that_is_asked_for_is_left(lift: Sequences) -> None:
     places = [show_formula(lift._targets[marks[1]]) for marks in lift._marks[:3]]
     assert len(set(places)) == 3
     assert not any(" or " in place for place in places)
+
+
+def test_alternatives_are_compared_with_what_is_left_of_the_target_alone() -> None:
+    x, y = ir.Signal("x"), ir.Signal("y")
+    low, five, one, three = (ir.Predicate(num) for num in (1.0 - x, y - 5.0, 1.0 - y, y - 3.0))
+    ranges = {name: Column(name, low=0.0, high=10.0) for name in "xy"}
+    marks = Landmarks([(low, five), (low, one, three)], ranges).of(ir.Predicate(x - 8.0))
+    assert marks == (low & low, five & (one | three))
