@@ -98,7 +98,8 @@ def prefix_bounds(formula: ir.Formula, columns: Mapping[str, Tensor]) -> Tensor:
     other operator, each prefix is evaluated. A value that is no number makes all entries no number, as in
     exported controllers.
     """
-    steps, batch = next(iter(columns.values())).shape
+    like = next(iter(columns.values()))
+    steps, batch = like.shape
     match formula:
         case ir.Predicate():
             (value,) = evaluate([formula], columns, ops=TORCH)
@@ -108,17 +109,16 @@ def prefix_bounds(formula: ir.Formula, columns: Mapping[str, Tensor]) -> Tensor:
             joined: Tensor = TORCH.join([prefix_bounds(item, columns) for item in items], PICKS[op])
             return joined
         case ir.Temporal("always", window, body) if not copied(formula):
-            last = min(steps - 1 if window.hi is None else window.hi, steps - 1)
-            there = range(window.lo, last + 1)
-            (values,) = evaluate([body], columns, ops=TORCH, start=there.start, count=len(there))
+            stop = steps if window.hi is None else min(window.hi + 1, steps)
+            (values,) = evaluate([body], columns, ops=TORCH, start=window.lo, count=stop - window.lo)
             least = values.cummin(0).values
             before = torch.full_like(least[:1], torch.inf).expand(window.lo, -1)
-            whole = torch.cat((before, least, least[-1:].expand(steps - 1 - last, -1)))
+            whole = torch.cat((before, least, least[-1:].expand(steps - stop, -1)))
             return torch.where(values.isnan().any(0), torch.nan, whole)
-    index = torch.arange(steps, device=next(iter(columns.values())).device)
-    beyond = torch.where(index[:, None] > index[None], 1.0, -1.0)
+    index = torch.arange(steps, device=like.device)
+    beyond = torch.where(index[:, None] > index, 1.0, -1.0)
     env = {name: column.repeat(1, steps) for name, column in columns.items()}
-    env[BEYOND] = beyond.to(next(iter(columns.values())).dtype).repeat_interleave(batch, 1)
+    env[BEYOND] = beyond.to(like.dtype).repeat_interleave(batch, 1)
     (margin,) = evaluate([open_ended(formula)], env, ops=TORCH)
     bounds: Tensor = margin[0].expand(steps * batch).view(steps, batch)
     return bounds
