@@ -50,7 +50,7 @@ from stlc.controller.training.method import Learner, Method
 from stlc.controller.policies.policy import ModelRollout
 from stlc.controller.run.checkpoint import load_checkpoint
 from stlc.controller.run.config import ResolvedConfig
-from stlc.controller.run.run import spec_hash, trained_on
+from stlc.controller.run.run import trained_on
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ class Climbing(Method):
         return Climber(task, config, **rest)
 
     def load(self, task, run, config, device):
-        saved = load_checkpoint(run, spec_hash=spec_hash(run), system_hash=trained_on(run))
+        saved = load_checkpoint(run, spec_hash=run.hashes["spec_hash"], system_hash=trained_on(run))
         return feedback(task, saved.tensors["gain"])
 
 
