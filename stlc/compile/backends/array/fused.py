@@ -29,7 +29,7 @@ _COPY, _ABS, _NEG, _ADD, _MUL, _PICK, _FILL, _WINDOW = range(8)
 _STEP = struct.Struct("11qd")
 """Structure `Step` of `windows.c`."""
 
-_BYTE = ctypes.c_char * 1
+_BYTE, _FLOAT64 = ctypes.c_char * 1, np.dtype(np.float64)
 
 
 class Place(NamedTuple):
@@ -68,7 +68,7 @@ class Fused:
         """
         library, held = kernel_library("float64"), [env[name] for name in self.columns]
         shape = next(iter(env.values())).shape  # what the plan was made for
-        if library is None or any(x.shape != shape or x.dtype != np.float64 for x in held):
+        if library is None or any(x.shape != shape or x.dtype != _FLOAT64 for x in held):
             return None
         out = np.empty((self.roots[-1].stop, *shape[1:]))
         try:

@@ -76,14 +76,13 @@ class ArrayPlan:
         """The array library."""
         return self.machine.windows.ops
 
-    def _in_c(self, env: Mapping[str, Array]) -> bool:
-        """True if one call of C is faster than the calls of NumPy."""
-        like, windows, domain = next(iter(env.values())), self.machine.windows, self.schedule.domain
-        short = windows.ops is NUMPY and like.ndim == 2 and like.size <= MOST and not self.beyond
-        return short and windows.semantics.exact and domain.end != "both" and NUMPY.kernel_pays(like)  # type: ignore[attr-defined]
-
     @cached_property
     def _fused(self) -> Fused | None:
+        """The plan in C; None where NumPy has to evaluate it."""
+        windows, domain = self.machine.windows, self.schedule.domain
+        exact = windows.ops is NUMPY and windows.semantics.exact
+        if not exact or domain.end == "both" or self.beyond or domain.samples > MOST:
+            return None
         return fused(self.schedule, self.batches, self.sources, self.machine.unknown)
 
     def values(self, env: Mapping[str, Array]) -> list[Array]:
@@ -106,9 +105,11 @@ class ArrayPlan:
 
     def roots(self, env: Mapping[str, Array]) -> list[Array]:
         """Return the values of the formulas, as `values` does."""
-        found = self._fused.run(env) if self._in_c(env) and self._fused is not None else None
-        if found is not None:
-            return found
+        plan, like = self._fused, next(iter(env.values()))
+        if plan and like.ndim == 2 and like.size <= MOST and NUMPY.kernel_pays(like):  # type: ignore[attr-defined]
+            found = plan.run(env)
+            if found is not None:
+                return found
         values = self.values(env)
         return [values[root] for root in self.schedule.roots]
 
