@@ -103,8 +103,7 @@ def prefix_bounds(formula: ir.Formula, columns: Mapping[str, Tensor]) -> Tensor:
     match formula:
         case ir.Predicate():
             (value,) = evaluate([formula], columns, ops=TORCH)
-            first: Tensor = value.expand(steps, batch)
-            return first
+            return torch.broadcast_to(value, (steps, batch))
         case ir.BoolOp(op, items) if not copied(formula):
             joined: Tensor = TORCH.join([prefix_bounds(item, columns) for item in items], PICKS[op])
             return joined
@@ -120,5 +119,4 @@ def prefix_bounds(formula: ir.Formula, columns: Mapping[str, Tensor]) -> Tensor:
     env = {name: column.repeat(1, steps) for name, column in columns.items()}
     env[BEYOND] = beyond.to(like.dtype).repeat_interleave(batch, 1)
     (margin,) = evaluate([open_ended(formula)], env, ops=TORCH)
-    bounds: Tensor = margin[0].expand(steps * batch).view(steps, batch)
-    return bounds
+    return torch.reshape(margin[0].expand(steps * batch), (steps, batch))

@@ -10,9 +10,6 @@ from numpy.typing import NDArray
 
 Floats: TypeAlias = NDArray[np.float64]
 
-_FEW = 64
-"""Blocks of samples that are not joined, and samples per further block."""
-
 
 class ColumnHistory:
     """Storage of the latest samples of time series (columns), which is joined when it is read.
@@ -25,7 +22,7 @@ class ColumnHistory:
     """
 
     def __init__(self) -> None:
-        self.first = self.samples = 0
+        self.first = self.samples = self._origin = 0
         self._names: tuple[str, ...] = ()
         self._blocks: list[Floats] = []
 
@@ -34,20 +31,20 @@ class ColumnHistory:
         self._names = tuple(columns)
         self._blocks.append(np.stack([*columns.values()]))
         self.samples += self._blocks[-1].shape[1]
-        if len(self._blocks) > _FEW + (self.samples - self.first) // _FEW:
-            self.forget(0)
+        if len(self._blocks) > 64 + (self.samples - self.first) // 64:
+            self.columns()
 
     def columns(self, first: int = 0, stop: int | None = None) -> dict[str, Floats]:
         """Return views of the stored samples of all series, from sample `first` to `stop` (exclusive)."""
-        self.forget(0)
-        low = max(first, self.first) - self.first
-        high = (self.samples if stop is None else min(stop, self.samples)) - self.first
+        if len(self._blocks) > 1:
+            self._blocks = [np.concatenate(self._blocks, axis=1)[:, self.first - self._origin :]]
+            self._origin = self.first
+        low = max(first, self.first) - self._origin
+        high = None if stop is None else stop - self._origin
         return dict(zip(self._names, self._blocks[0][:, low:high], strict=True)) if self._names else {}
 
     def forget(self, before: int) -> None:
-        """Drop the samples before sample `before`."""
-        first = min(max(before, self.first), self.samples)
-        if self._names and (first > self.first or len(self._blocks) > 1):
-            joined = np.concatenate(self._blocks, axis=1)
-            self._blocks = [joined[:, first - self.first :]]
-        self.first = first
+        """Drop the samples before sample `before`; those of one block are freed together."""
+        self.first = min(max(before, self.first), self.samples)
+        while len(self._blocks) > 1 and self._origin + self._blocks[0].shape[1] <= self.first:
+            self._origin += self._blocks.pop(0).shape[1]

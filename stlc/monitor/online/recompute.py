@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TypeAlias, final
 
 import numpy as np
@@ -42,7 +43,7 @@ Columns: TypeAlias = Mapping[str, Floats]
 
 
 @final
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class GrowingBounds:
     """Bounds on a requirement at instants of a growing trace, from samples that include all that it reads.
 
@@ -56,14 +57,15 @@ class GrowingBounds:
     horizon: int | None
     ending: Ends
 
+    _span = cached_property(lambda self: span_of(self.rule, self.horizon))  # asked after each sample
+
     def settled(self, samples: int) -> int:
         """The first instant at which a sample after `samples` of them may change the value."""
-        return max(samples - span_of(self.rule, self.horizon).future, 0)
+        return max(samples - self._span.future, 0)
 
     def needs(self, start: int) -> int:
         """The first sample that instants from `start` on read."""
-        span = span_of(self.rule, self.horizon)
-        return 0 if span.future == FAR else max(start - span.past, 0)
+        return 0 if self._span.future == FAR else max(start - self._span.past, 0)
 
     def live(self, signals: Columns, starts: range) -> tuple[Floats, Floats]:
         """Least and greatest robustness over all continuations, (instants, traces) each."""

@@ -70,13 +70,13 @@ class Fused:
         shape = next(iter(env.values())).shape  # what the plan was made for
         if library is None or any(x.shape != shape or x.dtype != _FLOAT64 for x in held):
             return None
-        out = np.empty((self.roots[-1].stop, *shape[1:]))
+        out = np.empty((self.roots[-1].stop, shape[1]))
         try:
             places = [ctypes.addressof(_BYTE.from_buffer(x)) for x in (out, *held)]
         except (TypeError, ValueError, BufferError):  # an array that is read only, has gaps, or is empty
             return None
         bases = (ctypes.c_void_p * (len(places) + 1))(None, *places)
-        steps, traces = len(self.code) // _STEP.size, math.prod(shape[1:])
+        steps, traces = len(self.code) // _STEP.size, shape[1]
         if library.run_all(self.code, steps, bases, self.memory, traces):
             raise MemoryError
         return [out] if len(self.roots) == 1 else [out[root] for root in self.roots]
