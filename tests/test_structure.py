@@ -10,7 +10,7 @@ from helpers.tools import ROOT, load_tool
 
 structure = load_tool("structure")
 
-NODES = 462440
+NODES = 462425
 CROSSINGS = 4.39
 CIRCLES: set[tuple[str, str]] = set()
 IMPLEMENTATIONS = {

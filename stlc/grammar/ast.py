@@ -20,7 +20,7 @@ class Node:
 
     span: Span = field(compare=False, repr=False)
     is_formula: ClassVar[bool] = False
-    """Whether the node is a formula by its form, whatever its operands are."""
+    """Form of the node: True if it is that of a formula, whatever the operands are."""
 
     def children(self) -> Iterator[Node]:
         """Yield the nodes directly below the node, in source order."""

@@ -21,6 +21,7 @@ Given: TypeAlias = Mapping[str, Any]
 """Signal -> array (time,) or (…, time); a vector is (…, time, k)."""
 
 UNNAMED = "the signals"
+_ARRAYS = "give an array of numbers, of truth values, or of the words of an enum"
 CLOCKS = ("time", "t")
 """Keys that hold the times, unless a requirement reads them."""
 
@@ -117,7 +118,7 @@ def numbers_in(name: str, values: Any) -> NDArray[np.float64]:
     """Return the array of the numbers in a list. Raises TraceError (E603) for other things in it."""
     array = _flat(name, values)
     if array.dtype.kind in "UcMm":
-        raise _refused(name, "holds other things than numbers where only numbers can be taken")
+        raise _refused(name, "holds texts, and only numbers can be taken here", "give numbers")
     return array.astype(np.float64)
 
 
@@ -141,6 +142,5 @@ def _is_missing(value: object) -> bool:
     return value is None or is_nan or type(value).__name__ in ("NAType", "NaTType")
 
 
-def _refused(name: str, what: str) -> TraceError:
-    help_ = ("give an array of numbers, of truth values, or of the words of an enum",)
-    return TraceError.of("E603", f"`{name}` of {UNNAMED} {what}", help=help_)
+def _refused(name: str, what: str, advice: str = _ARRAYS) -> TraceError:
+    return TraceError.of("E603", f"`{name}` of {UNNAMED} {what}", help=(advice,))

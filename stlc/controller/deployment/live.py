@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -28,11 +28,6 @@ class Margins:
     high: NDArray[np.float64]
     violated: NDArray[np.int64]
     open: NDArray[np.int64]
-
-    @staticmethod
-    def of(monitors: Sequence[Online], name: str) -> Margins:
-        """Return the margins of the requirement `name`; each agent has a monitor."""
-        return Margins(*map(np.array, zip(*(online.margin(name) for online in monitors), strict=True)))
 
     def status(self, agent: int) -> StatusInScope:
         """Violated if the agent violated it at any start, satisfied if it did at none and none is open."""
@@ -88,7 +83,6 @@ class LiveMonitor:
         self.task, self.setting = task, setting
         self.moment: SimulationStep | None = None
         self.counts: NDArray[np.int64] = np.zeros(len(SOURCES), dtype=np.int64)
-        self._names = [rule.name for rule in task.compiled.recorded]
         self._monitors: list[Online] = []
         self._states: list[NDArray[np.float64]] = []
         self._found: dict[str, Margins] = {}
@@ -111,7 +105,9 @@ class LiveMonitor:
             columns = [self.task.system.names.index(name) for name in self._monitors[0].signals]
             for online, rows in zip(self._monitors, states, strict=True):
                 online.push_block(rows[:, columns])
-            self._found = {name: Margins.of(self._monitors, name) for name in self._names}
+            for name in self._monitors[0].requirements:
+                each = zip(*(online.margin(name) for online in self._monitors), strict=True)
+                self._found[name] = Margins(*map(np.array, each))
         return self._found
 
     @property

@@ -71,7 +71,7 @@ class PlanVerdicts:
 
     @property
     def satisfied(self) -> Tensor:
-        """Whether each plan satisfies the specification, (batch,)."""
+        """Mask of the plans that satisfy the specification, (batch,)."""
         return TOLERANCE.satisfied(self.rho)
 
     def of(self, index: Tensor) -> PlanVerdicts:
