@@ -103,10 +103,13 @@ def complete(document: Document, offset: int) -> Completion:
     if units is not None:
         return Completion(offset - len(units), tuple(_units()))
     accepted = acceptable(piece)
-    offers = (
-        _everything(document, offset) if accepted is None else _fitting(document, offset, piece, accepted)
-    )
-    unique = {offer.text: offer for offer in reversed(list(offers))}
+    if accepted is None:
+        aliases = {word for word, each in OPERATORS.items() if word != each.name}
+        words = (Offer(x, "Keyword", doc=KEYWORDS.get(x, ""), order=7) for x in sorted(RESERVED - aliases))
+        offers = [*_names(document, offset), *_functions(), *words]
+    else:
+        offers = [*_fitting(document, offset, piece, accepted)]
+    unique = {offer.text: offer for offer in reversed(offers)}
     return Completion(start, tuple(sorted(unique.values(), key=lambda offer: (offer.order, offer.text))))
 
 
@@ -151,14 +154,6 @@ def _fitting(document: Document, offset: int, piece: str, accepted: frozenset[st
         yield from _functions()
     else:
         yield from _new_names(document, piece)
-
-
-def _everything(document: Document, offset: int) -> Iterator[Offer]:
-    yield from _names(document, offset)
-    yield from _functions()
-    aliases = {word for word, each in OPERATORS.items() if word != each.name}
-    words = sorted(RESERVED - aliases)
-    yield from (Offer(word, "Keyword", doc=KEYWORDS.get(word, ""), order=7) for word in words)
 
 
 def _names(document: Document, offset: int) -> Iterator[Offer]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from bisect import bisect_right
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -32,7 +33,6 @@ from stlc.lint.lint import Surroundings, lint
 from stlc.monitor.facts.findings import findings_on
 from stlc.signature import Column
 from stlc.source import Source, Span
-from stlc.units import Unit
 
 _ONLY_FOR_TRAINING = frozenset({"E306", "E307", "E309", "E310", "E312"})
 _MAX_LABELS = 8
@@ -110,15 +110,13 @@ class Document:
         if self.trace is not None and not (errors or self.missing):
             linted = (*linted, *findings_on(self.spec, self.trace, self.spec.system))
         mild = bool(errors) and errors <= _ONLY_FOR_TRAINING
-        found += [replace(self._place(one), mild=mild and one.severity == "error") for one in linted]
+        for one in linted:
+            if one.span is not None and one.span.source.name == self.source.name:
+                placed = Finding(one, self.source.span(one.span.start, one.span.end))
+            else:  # it is of another file
+                placed = self._about_system((one,))
+            found.append(replace(placed, mild=mild and one.severity == "error"))
         return tuple(sorted(found, key=lambda one: one.span.start))
-
-    def _place(self, finding: Diagnostic) -> Finding:
-        """Locate a diagnostic in this text; one of another file is placed where the system is named."""
-        span = finding.span
-        if span is not None and span.source.name == self.source.name:
-            return Finding(finding, self.source.span(span.start, span.end))
-        return self._about_system((finding,))
 
     def _about_system(self, findings: tuple[Diagnostic, ...]) -> Finding:
         first = findings[0]
@@ -290,18 +288,13 @@ def understand(
     """
     scope = Scope(temporal=True, time_unit=spec.time_unit)
     file = declared(spec, modules, interface, {}, scope)
-    columns = {decl.name: _ranged(decl, plain, unit, file.scope) for decl, plain, unit in file.found.columns}
+    columns = {}
+    for decl, plain, unit in file.found.columns:
+        columns[decl.name] = plain
+        with suppress(Failed):
+            columns[decl.name] = ranged(plain, unit, decl, file.scope)
     meaning = Meaning(file.scope, columns, {}, grid, interface)
     return replace(meaning, formulas=_formulas(spec, meaning))
-
-
-def _ranged(
-    decl: ast.Signal | ast.Param, plain: tuple[Column, ...], unit: Unit, scope: Scope
-) -> tuple[Column, ...]:
-    try:
-        return ranged(plain, unit, decl, scope)
-    except Failed:
-        return plain
 
 
 def _formulas(spec: Spec, meaning: Meaning) -> dict[str, typed.Formula]:

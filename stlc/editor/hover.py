@@ -20,7 +20,6 @@ from stlc.grammar.printer import show
 from stlc.grammar.scan import Lexeme
 from stlc.grammar.spec import STD, Spec
 from stlc.grammar.words import OPERATORS
-from stlc.signature import Column
 from stlc.source import Span
 from stlc.units import time_text
 
@@ -39,7 +38,8 @@ def hover(document: Document, offset: int) -> tuple[Span, str] | None:
     node = _temporal_at(document.spec, offset)
     other = lexeme is not None and lexeme.kind == "word" and lexeme.text.rstrip("_") not in _ALIASES
     if node is not None and not other:
-        return _place_of(document, node, lexeme, offset), _about_temporal(document, node)
+        word = (offset, offset) if lexeme is None else (lexeme.start, lexeme.end)
+        return _about_temporal(document, node, *word)
     if lexeme is None or lexeme.kind != "word":
         return None
     text = _about_word(document, lexeme.text, tag=before == "@")
@@ -61,36 +61,20 @@ def _lexeme(text: str, offset: int) -> tuple[Lexeme | None, str]:
     return found, before
 
 
-def _place_of(document: Document, node: ast.Temporal | ast.Until, lexeme: Lexeme | None, offset: int) -> Span:
-    """Return the source location that the hover text of a temporal operator refers to.
-
-    The location extends from the word under the cursor to the end of the operator's interval. If the operator
-    has no interval, it is the word alone.
-    """
-    word = (offset, offset) if lexeme is None else (lexeme.start, lexeme.end)
-    if node.interval is None:
-        return document.source.span(*word)
-    span = node.interval.span
-    return document.source.span(min(word[0], span.start), max(word[1], span.end))
-
-
 def _about_word(document: Document, word: str, *, tag: bool) -> str | None:
     if tag:
         return TAGS.get(word)
+    grid = document.grid
+    if word == "dt" and grid.dt is not None:
+        return f"{BUILT_IN[word]}\n\n{grid.in_words(Fraction(1))}"
+    if word == "T" and grid.horizon is not None:
+        return f"{BUILT_IN[word]}\n\n{grid.duration(grid.horizon)}"
     if word in BUILT_IN:
-        return f"{BUILT_IN[word]}{_grid_value(word, document.grid)}"
+        return BUILT_IN[word]
     for table in (FUNCTIONS, TYPES, KEYWORDS):
         if word in table:
             return table[word]
     return TEMPORAL.get(_ALIASES.get(word.rstrip("_"), ""))
-
-
-def _grid_value(word: str, grid: Grid) -> str:
-    if word == "dt" and grid.dt is not None:
-        return f"\n\n{grid.in_words(Fraction(1))}"
-    if word == "T" and grid.horizon is not None:
-        return f"\n\n{grid.duration(grid.horizon)}"
-    return ""
 
 
 # ------------------------------------------------------------------------- symbols
@@ -163,20 +147,18 @@ def _about_column(document: Document, symbol: Symbol) -> Iterator[str]:
     first = columns[0]
     unit = f" [{first.unit}]" if first.unit.text else ""
     size = f" vector of {len(columns)}" if len(columns) > 1 or first.name.endswith("[0]") else ""
-    yield f"{first.role} {first.kind}{size}{unit}{_range(first)}"
+    values = ""
+    if first.labels:
+        values = f": {', '.join(f'{name} = {value:g}' for name, value in first.labels)}"
+    elif first.kind != "bool" and first.low is not None and first.high is not None:
+        plain = f" {first.unit}" if first.unit.text else ""
+        nature = "enforced" if first.fact else "nominal"
+        values = f", {first.low:g} to {first.high:g}{plain} ({nature})"
+    yield f"{first.role} {first.kind}{size}{unit}{values}"
     system = document.system
     if system is not None and first.name.removesuffix("[0]") in system.places:
         place = system.places[first.name.removesuffix("[0]")]
         yield f"a state of {markdown_code(system.path.name)}, line {place.line}"
-
-
-def _range(column: Column) -> str:
-    if column.labels:
-        return f": {', '.join(f'{name} = {value:g}' for name, value in column.labels)}"
-    if column.kind == "bool" or column.low is None or column.high is None:
-        return ""
-    unit = f" {column.unit}" if column.unit.text else ""
-    return f", {column.low:g} to {column.high:g}{unit} ({'enforced' if column.fact else 'nominal'})"
 
 
 def _constant(value: Value) -> str:
@@ -205,22 +187,27 @@ def _temporal_at(spec: Spec, offset: int) -> ast.Temporal | ast.Until | None:
             continue
         first = node.span.start if isinstance(node, ast.Temporal) else node.left.span.end + 1
         body = node.body if isinstance(node, ast.Temporal) else node.right
-        if first <= offset <= (node.interval or body).span.start or _within(node, offset):
+        last = body.span.start if node.interval is None else node.interval.span.end
+        if first <= offset <= last:
             found = node
     return found
 
 
-def _within(node: ast.Temporal | ast.Until, offset: int) -> bool:
-    return node.interval is not None and node.interval.span.start <= offset <= node.interval.span.end
+def _about_temporal(
+    document: Document, node: ast.Temporal | ast.Until, start: int, end: int
+) -> tuple[Span, str]:
+    """Return (location, hover text) of a temporal operator whose word is at `start` to `end`.
 
-
-def _about_temporal(document: Document, node: ast.Temporal | ast.Until) -> str:
-    found = None if node.interval is None else document.meaning.interval(node.interval.span)
+    The location extends to the end of the operator's interval, if it has one.
+    """
     if node.interval is None:
         time = "up to now" if OPERATORS[node.op].past else "from now to the end of the trace"
     else:
+        span = node.interval.span
+        start, end = min(start, span.start), max(end, span.end)
+        found = document.meaning.interval(span)
         time = "" if found is None else _time(node.op, *found, document.grid)
-    return "\n\n".join(filter(None, (TEMPORAL[node.op], time)))
+    return document.source.span(start, end), "\n\n".join(filter(None, (TEMPORAL[node.op], time)))
 
 
 def _time(op: str, interval: typed.Interval, window: Window | None, grid: Grid) -> str:

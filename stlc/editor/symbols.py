@@ -100,8 +100,8 @@ def names_of(spec: Spec) -> SymbolNames:
     values: dict[str, Symbol] = {}
     types: dict[str, Symbol] = {}
     rules: dict[str, Symbol] = {}
-    for module in spec.imports:
-        symbol = _module(module)
+    modules = [_module(module) for module in spec.imports]
+    for symbol in modules:
         values.setdefault(symbol.name, symbol)
     for item in spec.items:
         space = {"enum": types, "requirement": rules, "assumption": rules}.get(item.noun, values)
@@ -111,7 +111,10 @@ def names_of(spec: Spec) -> SymbolNames:
                 member = _symbol(lexeme, "member", item.span, item)
                 values.setdefault(member.name, member)
     names = SymbolNames(values, types, rules, ())
-    found = {one.span: one for one in _all(spec, names)}
+    every = [Occurrence(symbol.span, symbol) for symbol in modules]
+    for item in spec.items:
+        every += _of_item(item, names)
+    found = {one.span: one for one in every}
     ordered = sorted(found.values(), key=lambda one: (one.span.start, one.span.end))
     return replace(names, occurrences=tuple(ordered))
 
@@ -188,14 +191,6 @@ def _bound(node: ast.Node) -> dict[str, Symbol]:
 # --------------------------------------------------------------------- occurrences
 
 
-def _all(spec: Spec, names: SymbolNames) -> Iterator[Occurrence]:
-    for module in spec.imports:
-        symbol = _module(module)
-        yield Occurrence(symbol.span, symbol)
-    for item in spec.items:
-        yield from _of_item(item, names)
-
-
 def _of_item(item: ast.Declaration, names: SymbolNames) -> Iterator[Occurrence]:
     own = Symbol(item.name, _kind(item), item.name_span, item)
     yield Occurrence(item.name_span, own)
@@ -228,7 +223,12 @@ def _uses(node: ast.Node, scope: Scope, names: SymbolNames) -> Iterator[Occurren
         case ast.Tag(_, name) if name in ("group", "scale", "id"):
             return
         case ast.Call(_, ast.Name(_, name), args) if name in scope:
-            yield from _named_arguments(args, scope[name])
+            called = scope[name].item
+            formals = {} if called is None else _arguments(called)
+            for arg in args:
+                if arg.name in formals:
+                    word = _words(arg.span)[0]
+                    yield Occurrence(arg.span.source.span(word.start, word.end), formals[arg.name])
         case _:
             pass
     bound = _bound(node)
@@ -236,11 +236,3 @@ def _uses(node: ast.Node, scope: Scope, names: SymbolNames) -> Iterator[Occurren
     for part in node.children():
         inner = isinstance(node, ast.Quantifier | ast.Freeze) and part is node.body
         yield from _uses(part, {**scope, **bound} if inner else scope, names)
-
-
-def _named_arguments(args: tuple[ast.Arg, ...], called: Symbol) -> Iterator[Occurrence]:
-    formals = {} if called.item is None else _arguments(called.item)
-    for arg in args:
-        if arg.name in formals:
-            word = _words(arg.span)[0]
-            yield Occurrence(arg.span.source.span(word.start, word.end), formals[arg.name])
