@@ -123,21 +123,17 @@ class _Chain:
             value = self.rule(context, span, [left.value, self.operators[middle - 1], right.value])
             return _Built(value, _depth((left, right), span))
 
-        middle = self._split(low, high) if high - low > LONG_CHAIN else low
+        middle = low
+        if high - low > LONG_CHAIN:  # split at the associative operator nearest to the middle
+            half = (low + high) // 2
+            near = (at for step in range(high - low) for at in (half - step, half + step) if low < at < high)
+            middle = next((at for at in near if self.operators[at - 1].text not in _INVERSE), low)
         if middle > low:
             return joined(self.tree(context, low, middle), self.tree(context, middle, high), middle, high)
         found = self.operands[low]
         for index in range(low + 1, high):
             found = joined(found, self.operands[index], index, index + 1)
         return found
-
-    def _split(self, low: int, high: int) -> int:
-        """Return the index nearest to the middle with an associative operator before it; `low` if none."""
-        middle = (low + high) // 2
-        places = (
-            at for step in range(high - low) for at in (middle - step, middle + step) if low < at < high
-        )
-        return next((at for at in places if self.operators[at - 1].text not in _INVERSE), low)
 
 
 def _depth(parts: Iterable[_Built], span: Span) -> int:

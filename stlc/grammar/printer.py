@@ -49,18 +49,15 @@ _ARITHMETIC = {
 }
 
 
-def _level(expr: ast.Expr) -> Level:
-    if isinstance(expr, ast.Quantity) and expr.value < 0:
-        return Level.SIGN
-    if isinstance(expr, (ast.Logic, ast.Binary)):
-        return (_LOGIC | _ARITHMETIC)[expr.op]
-    return _LEVELS.get(type(expr), Level.ATOM)
-
-
 def show_at(expr: ast.Expr, least: Level) -> str:
     """Return the text of an expression, in parentheses if it binds more loosely than the level `least`."""
     text = show_expr(expr)
-    return text if _level(expr) >= least else f"({text})"
+    level = _LEVELS.get(type(expr), Level.ATOM)
+    if isinstance(expr, ast.Quantity) and expr.value < 0:
+        level = Level.SIGN
+    elif isinstance(expr, (ast.Logic, ast.Binary)):
+        level = (_LOGIC | _ARITHMETIC)[expr.op]
+    return text if level >= least else f"({text})"
 
 
 def show_expr(expr: ast.Expr) -> str:

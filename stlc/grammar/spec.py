@@ -317,25 +317,25 @@ class _Loader:
         return tuple(found)
 
     def _module(self, written: ast.Import, importer: str, around: tuple[str, ...]) -> Module:
-        key = self._key(written, importer)
+        if written.is_file:
+            key = posixpath.normpath(posixpath.join(posixpath.dirname(importer), written.target))
+        elif written.target == "std":
+            key = STD
+        else:
+            help_ = f'`import std`, or a file: `import "{written.target}.stl" as {written.target}`'
+            raise _refused(written, f"there is no library `{written.target}`", help_)
         if key in around:
             chain = " -> ".join(name or self.home.name for name in (*around[around.index(key) :], key))
             raise _refused(written, f"`{written.target}` imports itself", note=chain)
-        alias = written.alias or _stem(written)
+        alias = written.alias or Path(written.target).stem
+        if not (written.alias or alias.isidentifier()):
+            raise _refused(written, f"`{alias}` cannot be a name", f'import "{written.target}" as m')
         if key not in self.specs:
             if max(len(self.specs), len(around)) >= _MOST:
                 raise _refused(written, f"more than {_MOST} files are imported")
             self.specs[key] = Spec.parse(self._source(written, key))
         spec = self.specs[key]
         return Module(key, alias, written, spec, self.imports(spec, key, around))
-
-    def _key(self, written: ast.Import, importer: str) -> str:
-        if written.is_file:
-            return posixpath.normpath(posixpath.join(posixpath.dirname(importer), written.target))
-        if written.target != "std":
-            help_ = f'`import std`, or a file: `import "{written.target}.stl" as {written.target}`'
-            raise _refused(written, f"there is no library `{written.target}`", help_)
-        return STD
 
     def _source(self, written: ast.Import, key: str) -> Source:
         if self.library is not None and key in self.library:
@@ -349,13 +349,6 @@ class _Loader:
         except UsageError as error:
             first = error.diagnostics[0]
             raise _refused(written, first.message, *first.help) from None
-
-
-def _stem(written: ast.Import) -> str:
-    name = Path(written.target).stem
-    if name.isidentifier():
-        return name
-    raise _refused(written, f"`{name}` cannot be a name", f'import "{written.target}" as m')
 
 
 def _refused(written: ast.Import, message: str, *help_: str, note: str = "") -> SpecError:

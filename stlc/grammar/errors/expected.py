@@ -61,7 +61,13 @@ def expected(failure: ParseFailure) -> Diagnostic:
     message = f"expected {choice}{_context(failure)}, found {_found(failure)}"
     label = "" if failure.found is not None else f"expected {words[0]} here"
     advice = _product(failure)
-    return Diagnostic("E010", message, failure.span, label, _labels(failure), advice, _notes(failure))
+    near = (failure.found, failure.previous) if failure.wants_operand else ()
+    letter = next((lexeme.text for lexeme in near if lexeme is not None and lexeme.text in _LETTERS), None)
+    notes: tuple[str, ...] = ()
+    if letter is not None:  # it may be meant as a name
+        operator = OPERATORS[letter].name
+        notes = (f"`{letter}` means `{operator}`; a name of your own is written `` `{letter}` ``",)
+    return Diagnostic("E010", message, failure.span, label, _labels(failure), advice, notes)
 
 
 def point(failure: ParseFailure, lexeme: Lexeme) -> Span:
@@ -329,15 +335,6 @@ def _found(failure: ParseFailure) -> str:
     if failure.piece.rule == "expr":
         return "the end of the expression"
     return "the end of the file" if failure.follower is None else "the next declaration"
-
-
-def _notes(failure: ParseFailure) -> tuple[str, ...]:
-    """Return a note if a letter such as `F`, which is an operator, seems to be meant as a name; else ()."""
-    near = (failure.found, failure.previous) if failure.wants_operand else ()
-    name = next((lexeme.text for lexeme in near if lexeme is not None and lexeme.text in _LETTERS), None)
-    if name is None:
-        return ()
-    return (f"`{name}` means `{OPERATORS[name].name}`; a name of your own is written `` `{name}` ``",)
 
 
 def _shortened(text: str) -> str:

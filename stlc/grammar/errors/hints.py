@@ -216,8 +216,13 @@ def _vector(failure: ParseFailure) -> Diagnostic | None:
 
 def _vector_read_as_interval(failure: ParseFailure, bracket: Bracket, found: Lexeme) -> Diagnostic | None:
     inside = [x for x in failure.before if x.start > bracket.opening.start][:-1]
-    if not bracket.interval or bracket.closing is None or _looks_like_time(inside):
+    if not bracket.interval or bracket.closing is None:
         return None
+    # bounds that look like times are those of an interval
+    units = {"s", "ms", "us", "ns", "min", "h", "step", "steps"}
+    for before, x in zip([inside[0], *inside], inside, strict=False):
+        if x.text in ("T", "end", "inf", "dt") or (x.text in units and before.kind == "number"):
+            return None
     operator = failure.before[failure.before.index(bracket.opening) - 1]
     index = len(failure.before)
     last = failure.lexemes[max(failure.operand_after(index) - 1, index)]
@@ -230,14 +235,6 @@ def _vector_read_as_interval(failure: ParseFailure, bracket: Bracket, found: Lex
         f"read as the interval from {bounds}",
         (rest.label("so this has no left-hand side"),),
         help=(f"{operator.text} ({read.text} {rest.text})     or name it:  def p = {read.text}",),
-    )
-
-
-def _looks_like_time(inside: list[Lexeme]) -> bool:
-    units = {"s", "ms", "us", "ns", "min", "h", "step", "steps"}
-    return any(
-        x.text in ("T", "end", "inf", "dt") or (x.text in units and before.kind == "number")
-        for before, x in zip([inside[0], *inside], inside, strict=False)
     )
 
 

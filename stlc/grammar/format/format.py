@@ -199,20 +199,16 @@ def _bracket(text: Text, opening: int) -> Group:
         comma = start
         while comma < closing and text.tokens[comma].text != ",":
             comma = behind(text, comma)
-        inside += _entry(text, start, comma)
+        if comma - start > 2 and text.tokens[start].kind == "NAME" and text.tokens[start + 1].text == "=":
+            inside += (*words(text, start, start + 2), BLANK)
+            start += 2
+        inside += expression(text, start, comma)
         if comma < closing:
             inside += [_word(text, comma), LINE]
         start = comma + 1
     if len(inside) == 1:
         return Group((_word(text, opening), _word(text, closing)))
     return Group((_word(text, opening), Nest(tuple(inside)), edge, _word(text, closing)))
-
-
-def _entry(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """Layout elements of an entry of a bracket: an expression, or `name = expression`."""
-    if end - start > 2 and text.tokens[start].kind == "NAME" and text.tokens[start + 1].text == "=":
-        return (*words(text, start, start + 2), BLANK, *expression(text, start + 2, end))
-    return expression(text, start, end)
 
 
 _OWN_COLUMN = {"const_decl": 2, "param_in": 2, "param_from": 2}
@@ -246,7 +242,7 @@ def lay_out(layout: TokenLayout, unclear: Sequence[Ambiguity], *, width: int) ->
         body = tokens[sum(map(len, tags)) :]
         for part, kind in (*((tag, "tag") for tag in tags), (body, item.rule)):
             _comments(part[0].before, page)
-            _declaration(prepare(_bare(part)), kind, page, width)
+            _declaration(prepare((replace(part[0], before=()), *part[1:])), kind, page, width)
     _comments(layout.rest, page)
     lines = align(page.columns)
     return "".join(f"{line}\n" for line in lines)
@@ -255,14 +251,6 @@ def lay_out(layout: TokenLayout, unclear: Sequence[Ambiguity], *, width: int) ->
 def _comments(comments: Sequence[Comment], page: _Page) -> None:
     for comment in comments:
         page.add(comment.text, apart=comment.apart, kind="comment")
-
-
-def _bare(tokens: Sequence[Token]) -> tuple[Token, ...]:
-    """Return `tokens` without the comments above the first token.
-
-    The formatter prints these comments on their own lines.
-    """
-    return (replace(tokens[0], before=()), *tokens[1:])
 
 
 def _tags(tokens: Sequence[Token]) -> list[Sequence[Token]]:

@@ -65,7 +65,11 @@ def prepare(tokens: Sequence[Token]) -> Text:
     signs = {i for i, token in enumerate(text.tokens) if token.kind == "PLUS" and text.is_sign(i)}
     text = _without(text, signs)
     text = _without(text, _doubled(text))
-    _check_depth(text)
+    depth = 0
+    for token in text.tokens:
+        depth += (token.text in _OPENING) - (token.text in _CLOSING)
+        if depth > MAX_DEPTH:
+            raise SpecError.of("E005", f"brackets are nested more than {MAX_DEPTH} deep")
     return _with_commas(text)
 
 
@@ -92,9 +96,14 @@ def gap(text: Text, index: int) -> str:
         return ""
     if right.text in _OPENING:
         return "" if text.roles[index] in ("call", "index", "interval") else " "
-    if left.text in (".", "..", "^") or right.text in (".", "..", "^"):
-        return " " if _would_join(left, right) else ""
-    return " "
+    if not {left.text, right.text} & {".", "..", "^"}:
+        return " "
+    # a blank keeps tokens apart that would be read as others: `1 .x`, `m ^2`
+    if right.text == "^":
+        return " " if left.kind == "UNIT" else ""
+    if left.kind == "NUMBER":
+        return " " if right.text == "." or left.text.endswith(".") else ""
+    return " " if right.kind == "NUMBER" and right.text.startswith(".") else ""
 
 
 def _hugs_right(text: Text, index: int) -> bool:
@@ -110,22 +119,11 @@ def _hugs_left(text: Text, index: int) -> bool:
     token = text.tokens[index]
     if token.text in _CLOSING:
         return text.roles[text.partner[index]] != "enum"
-    return token.text == "," or token.kind == "TYPE_SIZE" or (token.text == ":" and not _typed(text, index))
-
-
-def _typed(text: Text, index: int) -> bool:
-    """True if the colon at `index` precedes a type, as in `signal x : Type`; it has a blank before it."""
+    if token.text != ":":
+        return token.text == "," or token.kind == "TYPE_SIZE"
+    # a blank precedes the colon of a type, as in `signal x : Type`
     declared = any(token.kind in ("_SIGNAL", "_CONST", "_PARAM") for token in text.tokens[:2])
-    return declared and not any(token.text == "=" for token in text.tokens[:index])
-
-
-def _would_join(left: Token, right: Token) -> bool:
-    """True if the tokens `left` and `right` would be read as other tokens without a blank: `1 .x`, `m ^2`."""
-    if right.text == "^":
-        return left.kind == "UNIT"
-    if left.kind == "NUMBER":
-        return right.text == "." or left.text.endswith(".")
-    return right.kind == "NUMBER" and right.text.startswith(".")
+    return not declared or any(token.text == "=" for token in text.tokens[:index])
 
 
 # --------------------------------------------------------------------------- brackets
@@ -146,8 +144,11 @@ def _paired(tokens: tuple[Token, ...]) -> Text:
         elif token.text in _CLOSING:
             opening = still_open.pop()
             text.partner[opening], text.partner[index] = index, opening
-            if text.roles[opening] == "group" and _holds_interval(text, opening):
-                text.roles[opening] = "interval"
+            # an interval follows a temporal operator, and contains a comma or is closed by `]`
+            temporal = opening > 0 and tokens[opening - 1].kind in ("UNARY", "BINARY")
+            if temporal and text.roles[opening] == "group":
+                several = any(tokens[i].text == "," for i in level(text, opening))
+                text.roles[opening] = "interval" if several or token.text == "]" else "group"
     return text
 
 
@@ -166,17 +167,6 @@ def _role(text: Text, index: int) -> Role:
         if opening and text.tokens[opening - 1].kind == "EXTREME_BRACKET":
             return "call"
     return "group" if token.text == "(" else "list"
-
-
-def _holds_interval(text: Text, opening: int) -> bool:
-    """True if the bracket at `opening` is the interval of a temporal operator.
-
-    An interval follows a temporal operator, and contains a comma or is closed by `]`.
-    """
-    closing = text.partner[opening]
-    if not opening or text.tokens[opening - 1].kind not in ("UNARY", "BINARY"):
-        return False
-    return text.tokens[closing].text == "]" or any(text.tokens[i].text == "," for i in level(text, opening))
 
 
 def level(text: Text, opening: int) -> list[int]:
@@ -230,14 +220,6 @@ def _without(text: Text, dropped: set[int]) -> Text:
     """Return the text without the tokens at the indices `dropped`; a token with a comment is kept."""
     kept = tuple(t for i, t in enumerate(text.tokens) if i not in dropped or _commented(t))
     return _paired(kept) if len(kept) < len(text.tokens) else text
-
-
-def _check_depth(text: Text) -> None:
-    depth = 0
-    for token in text.tokens:
-        depth += (token.text in _OPENING) - (token.text in _CLOSING)
-        if depth > MAX_DEPTH:
-            raise SpecError.of("E005", f"brackets are nested more than {MAX_DEPTH} deep")
 
 
 def _with_commas(text: Text) -> Text:
