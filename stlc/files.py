@@ -257,7 +257,9 @@ class File:
         start = Path(*literal)
         try:
             paths = [
-                path for path in start.glob(str(Path(*rest))) if not _hidden(path.relative_to(start), rest)
+                path
+                for path in start.glob(str(Path(*rest)))
+                if all(part in rest or not part.startswith(".") for part in path.relative_to(start).parts)
             ]
         except OSError as error:
             raise usage(f"cannot look up `{pattern}`: {os_reason(error)}", code="U102") from None
@@ -315,7 +317,8 @@ def decoded(name: str, data: bytes, root: str = "") -> Source:
     """Return the content of a text file as a source. Raises SpecError (E003, E005), as `File.read` does."""
     if len(data) > File.MAX_BYTES:
         raise _too_large(name)
-    if _is_binary_mesh(data):
+    # binary stereolithography, also `.stl`: a header of 80 bytes, the number of triangles, 50 bytes for each
+    if len(data) >= 84 and b"\0" in data and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):
         raise SpecError(_mesh(name, None))
     try:
         text = data.decode("utf-8-sig")
@@ -327,14 +330,6 @@ def decoded(name: str, data: bytes, root: str = "") -> Source:
     if _MESH.match(text):
         raise SpecError(_mesh(name, source))
     return source
-
-
-def _is_binary_mesh(data: bytes) -> bool:
-    """True if the data are a 3-D mesh in binary stereolithography format, whose suffix is also `.stl`.
-
-    Such a file has a header of 80 bytes, the number of triangles, and 50 bytes for each triangle.
-    """
-    return len(data) >= 84 and b"\0" in data and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little")
 
 
 def _mesh(name: str, source: Source | None) -> Diagnostic:
@@ -397,11 +392,6 @@ def _specs_below(name: str) -> Iterator[str]:
     if not found:
         raise usage(f"there is no specification in `{name}`", code="U102")
     yield from map(str, found)
-
-
-def _hidden(path: Path, pattern: Sequence[str]) -> bool:
-    """True if a part of `path` begins with a dot and is not itself a part of the pattern."""
-    return any(part.startswith(".") and part not in pattern for part in path.parts)
 
 
 def _is_bag(path: Path) -> bool:

@@ -72,7 +72,10 @@ def plain(value: object) -> Json:
         case int():
             return int(value)
         case float() | Fraction():
-            return _number(float(value))
+            number = float(value)
+            if math.isfinite(number):
+                return number
+            return "nan" if math.isnan(number) else "inf" if number > 0 else "-inf"
         case Mapping():
             return {str(key): plain(item) for key, item in value.items()}
         case list() | tuple() | set() | frozenset():
@@ -100,12 +103,6 @@ def _entries(record: object, keys: Iterable[Key]) -> Iterator[tuple[str, object]
         blank = isinstance(value, str | list | tuple | dict) and not value
         if not (key.mark and value is None) and not (key.mark == "?" and blank):
             yield key.name, value
-
-
-def _number(value: float) -> float | str:
-    if math.isfinite(value):
-        return value
-    return "nan" if math.isnan(value) else "inf" if value > 0 else "-inf"
 
 
 def dumps(value: object, *, indent: int | None = None) -> str:

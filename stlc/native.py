@@ -126,7 +126,13 @@ def _key(text: str, using: str) -> str:
     Raises:
         CompilerError: the compiler cannot be used.
     """
-    parts = (text, using, version(using), *FLAGS, *VECTOR_FLAGS, _processor())
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    # the instructions of the processor, which `-march=native` makes use of
+    features = next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    parts = (text, using, version(using), *FLAGS, *VECTOR_FLAGS, features)
     return hashlib.sha256("\0".join(parts).encode(errors="surrogateescape")).hexdigest()[:32]
 
 
@@ -216,15 +222,6 @@ def _attempted(using: str, source: Path, target: Path, level: str) -> str:
         if done.code == 0 and target.is_file():
             return ""
     return done.failure
-
-
-def _processor() -> str:
-    """Instruction-set features of the processor, which `-march=native` makes use of; "" if unknown."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return ""
-    return next((line for line in lines if line.startswith(("flags", "Features"))), "")
 
 
 def cores() -> int:

@@ -163,7 +163,12 @@ def read(kind: Any, value: Json, key: str = "") -> Any:
     if is_dataclass(kind):
         return _read_record(kind, value, key)  # type: ignore[arg-type]
     if origin is Annotated:
-        return _read_annotated(args[0], args[1], value, key)
+        if args[1] == "unbounded" and isinstance(value, str) and value in _INFINITE:
+            return _INFINITE[value]
+        found = read(args[0], value, key)
+        if isinstance(args[1], int) and found < args[1]:
+            raise _unlike(value, f"a number from {args[1]} on", key)
+        return found
     if origin is Literal:
         if not any(value == each and type(value) is type(each) for each in args):
             raise _unlike(value, f"one of {', '.join(map(str, args))}", key)
@@ -175,7 +180,11 @@ def read(kind: Any, value: Json, key: str = "") -> Any:
             raise _unlike(value, "a JSON object", key)
         return {name: read(args[1], each, _below(key, name)) for name, each in value.items()}
     if origin in _LISTS:
-        return _read_list(origin, args, value, key)
+        fixed = origin is tuple and Ellipsis not in args
+        if not isinstance(value, list) or (fixed and len(value) != len(args)):
+            raise _unlike(value, f"a list of {len(args)}" if fixed else "a list", key)
+        items = [read(args[n if fixed else 0], each, _below(key, n)) for n, each in enumerate(value)]
+        return items if origin is list else tuple(items)
     accepted: Any = {float: (float, int), Path: str}.get(kind, kind)
     if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
         raise _unlike(value, _NOUNS[kind], key)
@@ -201,15 +210,6 @@ def _has_default(field: Field[Any]) -> bool:
     return field.default is not MISSING or field.default_factory is not MISSING
 
 
-def _read_annotated(kind: Any, what: Any, value: Json, key: str) -> Any:
-    if what == "unbounded" and isinstance(value, str) and value in _INFINITE:
-        return _INFINITE[value]
-    found = read(kind, value, key)
-    if isinstance(what, int) and found < what:
-        raise _unlike(value, f"a number from {what} on", key)
-    return found
-
-
 def _read_union(kinds: Sequence[Any], value: Json, key: str) -> Any:
     if value is None and types.NoneType in kinds:
         return None
@@ -223,14 +223,6 @@ def _read_union(kinds: Sequence[Any], value: Json, key: str) -> Any:
     if len(others) == 1:
         raise errors[0]
     raise _unlike(value, " or ".join(_NOUNS.get(each, "a record") for each in others), key)
-
-
-def _read_list(origin: Any, args: Sequence[Any], value: Json, key: str) -> Any:
-    fixed = origin is tuple and Ellipsis not in args
-    if not isinstance(value, list) or (fixed and len(value) != len(args)):
-        raise _unlike(value, f"a list of {len(args)}" if fixed else "a list", key)
-    items = [read(args[n if fixed else 0], each, _below(key, n)) for n, each in enumerate(value)]
-    return items if origin is list else tuple(items)
 
 
 def _below(key: str, name: object) -> str:

@@ -442,8 +442,11 @@ class RunDir:
         data = (dumps(row) + "\n").encode()
         path = self.place(name)
         with reported(f"write `{self.shown}/{name}`"), path.open("ab+") as file:
-            _drop_torn_line(file.fileno())
-            os.write(file.fileno(), data)
+            descriptor = file.fileno()
+            size = os.fstat(descriptor).st_size
+            if size and os.pread(descriptor, 1, size - 1) != b"\n":
+                os.ftruncate(descriptor, os.pread(descriptor, size, 0).rfind(b"\n") + 1)
+            os.write(descriptor, data)
 
     def rows(self, name: str = ROWS) -> list[dict[str, Any]]:
         """Read the rows of a file of JSON lines, without an incomplete last one; [] if there is no file.
@@ -521,20 +524,16 @@ def _of_spec(path: Path, root: Path) -> RunDir:
         UsageError: R101, there is no such run either.
     """
     runs = RunDir.every(root)
-    trained = [run for run in runs if _spec_path(run) == path.resolve()]
+    trained = []
+    for run in runs:
+        with suppress(RunError):  # it has no readable record
+            if Path(str(run.record().get("spec_path"))).resolve() == path.resolve():
+                trained.append(run)
     found = trained or [run for run in runs if run.path.parent.name == _slug(path.stem)]
     if not found:
         help_ = (f"train one: {shell(('stlc', 'train', str(path)))}",)
         raise usage(f"there is no run of `{path}` in `{root}`", *help_, code="R101")
     return found[-1]
-
-
-def _spec_path(run: RunDir) -> Path | None:
-    """Path of the specification file from which a run was trained; None if the run has no readable record."""
-    try:
-        return Path(str(run.record().get("spec_path"))).resolve()
-    except RunError:
-        return None
 
 
 def _names(run: RunDir) -> tuple[str, str, str, str]:
@@ -598,14 +597,6 @@ def _point(link: Path, target: str) -> None:
     except (OSError, NotImplementedError):
         return
     temporary.replace(link)
-
-
-def _drop_torn_line(descriptor: int) -> None:
-    size = os.fstat(descriptor).st_size
-    if size == 0 or os.pread(descriptor, 1, size - 1) == b"\n":
-        return
-    data = os.pread(descriptor, size, 0)
-    os.ftruncate(descriptor, data.rfind(b"\n") + 1)
 
 
 # ---------------------------------------------------------------------- words
