@@ -61,9 +61,18 @@ def falsify(
     if isinstance(found, ReplayedFinding):
         return Answer(found, lambda: emit("\n".join(_again(found))), int(found.reason is not None))
     if not isinstance(found, FalsifiedSystem):
+        excluded = " (`assume` or `where` excludes it)" if found.verdict == "out of scope" else ""
+        same = "the trace is the same, bit for bit"
+        if found.different:
+            same = f"different: {', '.join(found.different)}"
+        text = f"{found.requirement}: {found.verdict}{excluded}, robustness {found.margin:.6g}; {same}"
         codes = {"violated": 1, "inconclusive": INCONCLUSIVE}
-        return Answer(found, lambda: emit(_repeated(found)), codes.get(found.verdict, 0))
-    lost = (_lost(found),) if found.lost else ()
+        return Answer(found, lambda: emit(text), codes.get(found.verdict, 0))
+    lost: tuple[Diagnostic, ...] = ()
+    if found.lost:
+        count = f"{found.lost:,} simulation{'s were' if found.lost != 1 else ' was'}"
+        message = f"{count} lost with the processes that made them"
+        lost = (Diagnostic("R406", message, note=found.reasons),)
     code = INCONCLUSIVE if any(each.search.inconclusive for each in found.requirements) else 0
     code = MissingError.exit_code if lost else code
     if found.failures or found.violated:
@@ -76,20 +85,6 @@ def falsify(
         emit("\n".join((*lines, *_finding_lines(found.findings))))
 
     return Answer(found, show, code, lost)
-
-
-def _lost(found: FalsifiedSystem) -> Diagnostic:
-    """The finding R406 about simulations that were lost with their workers."""
-    count = f"{found.lost:,} simulation{'s were' if found.lost != 1 else ' was'}"
-    return Diagnostic("R406", f"{count} lost with the processes that made them", note=found.reasons)
-
-
-def _repeated(found: ReplayedCounterexample) -> str:
-    excluded = " (`assume` or `where` excludes it)" if found.verdict == "out of scope" else ""
-    same = "the trace is the same, bit for bit"
-    if found.different:
-        same = f"different: {', '.join(found.different)}"
-    return f"{found.requirement}: {found.verdict}{excluded}, robustness {found.margin:.6g}; {same}"
 
 
 def _again(found: ReplayedFinding) -> Iterator[str]:

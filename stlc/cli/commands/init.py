@@ -92,12 +92,17 @@ def init(
     if spec is not None:
         files, following = _specification(folder, spec, from_)
     elif system is not None:
-        files, following = _system_file(folder, system)
+        path = _path(folder, system, "systems", ".yaml")
+        files = {path: _template("system.yaml").format(name=path.stem)}
+        following = shell(("stlc", "system", "show", operand(str(path))))
     else:
         files = {folder / name: text for name, text in _project(example or FIRST).items()}
         here = "" if folder == Path() else f"{shell(('cd', operand(str(folder))))} && "
         following = here + _following(files)
-    _require_new(files, force=force)
+    there = [str(path) for path in files if path.exists()]
+    if there and not force:
+        verb = "is" if len(there) == 1 else "are"
+        raise usage(f"{', '.join(there)} {verb} there already", "overwrite: --force")
     for path, text in files.items():
         File(path).write(text)
     if spec is None and system is None:
@@ -110,14 +115,6 @@ def init(
         say(f"next: {following}")
 
     return Answer(CreatedFiles([*map(str, files)]), show)
-
-
-def _require_new(paths: Iterable[Path], *, force: bool) -> None:
-    """Raise UsageError (U101) if one of the files exists; with `force`, do nothing."""
-    there = [str(path) for path in paths if path.exists()]
-    if there and not force:
-        verb = "is" if len(there) == 1 else "are"
-        raise usage(f"{', '.join(there)} {verb} there already", "overwrite: --force")
 
 
 # ------------------------------------------------------------------------ a project
@@ -220,13 +217,6 @@ def _specification(folder: Path, name: str, from_: str | None) -> tuple[dict[Pat
         reference = Path(os.path.relpath(decl.path, path.parent)).as_posix()
     text = format_text(Source(str(path), _spec_text(path.stem, decl, reference)))
     return {path: text}, shell(("stlc", "lint", operand(str(path))))
-
-
-def _system_file(folder: Path, name: str) -> tuple[dict[Path, str], str]:
-    """Path and text of a new system file `NAME.yaml`, and the command to run next."""
-    path = _path(folder, name, "systems", ".yaml")
-    text = _template("system.yaml").format(name=path.stem)
-    return {path: text}, shell(("stlc", "system", "show", operand(str(path))))
 
 
 def _path(folder: Path, name: str, kind: str, suffix: str) -> Path:

@@ -101,21 +101,16 @@ def _show(format_: Format, result: Lint, code: int) -> None:
 
             emit(dumps(sarif(findings), indent=2))
         case "text":
+            from stlc.monitor.linted import several
+
             if findings:
                 from stlc.cli.framework.render import render_text
 
                 emit(render_text(findings, color=wants_color(sys.stdout)).rstrip("\n") + "\n", styled=True)
-            say(_summary(result))
-
-
-def _summary(result: Lint) -> str:
-    """Last line of the output: the numbers of findings and of files, and what to do next."""
-    from stlc.monitor.linted import several
-
-    fixed = f"fixed {several(result.fixed, 'finding')}; " if result.fixed else ""
-    repairable = sum(finding.fix is not None and finding.fix.same for finding in result.findings)
-    more = f"; {repairable} can be repaired: stlc lint --fix" if repairable else ""
-    return f"{fixed}{result.brief}{more}"
+            fixed = f"fixed {several(result.fixed, 'finding')}; " if result.fixed else ""
+            repairable = sum(finding.fix is not None and finding.fix.same for finding in findings)
+            more = f"; {repairable} can be repaired: stlc lint --fix" if repairable else ""
+            say(f"{fixed}{result.brief}{more}")
 
 
 # ------------------------------------------------------- findings for other programs

@@ -184,13 +184,6 @@ def _record(
     )
 
 
-def _bound(value: float) -> str:
-    """Text of a bound on a robustness; in words if it is infinite."""
-    from stlc.view.words import number
-
-    return number(value) if math.isfinite(value) else "no bound"
-
-
 def _missed_lines(plans: Plans) -> list[str]:
     """Lines that name the requirements that the best plans violate, and a planner that does better."""
     from stlc.view.words import number
@@ -210,7 +203,7 @@ def _missed_lines(plans: Plans) -> list[str]:
 
 def _tube_lines(plans: Plans) -> list[str]:
     """Lines with the bounds of `--tube`; none without it."""
-    from stlc.view.words import listing
+    from stlc.view.words import listing, number
 
     found = plans.tube
     if found is None:
@@ -227,7 +220,7 @@ def _tube_lines(plans: Plans) -> list[str]:
         lines.append(f"  taken as exact, as conditions or limits read them: {exact}")
     width = max(map(len, found.requirements))
     for name, each in found.requirements.items():
-        low, high = (_bound(getattr(each, end)) for end in ("low", "high"))
+        low, high = (number(bound) if math.isfinite(bound) else "no bound" for bound in (each.low, each.high))
         count = f"   {each.guaranteed:,} guaranteed" if many > 1 else ""
         lines.append(f"  {name:<{width}}  {low} to {high}{count}")
     return lines

@@ -63,7 +63,9 @@ def plot(
 
     require_drawing()
     path = RunDir.recorded_trace(what, reading.runs)
-    target = _target(output, path)
+    target = output or path.with_suffix(".svg")
+    if target.suffix not in _FORMATS:
+        raise usage(f"`{target}` is no picture", f"its suffix is one of {' '.join(_FORMATS)}")
     require_separate([("--out", target)], (path, reading.spec, reading.system))
     question = reading.question(require=())
     loaded = load(path, question, planned=windows or places)  # plans name the places that they have to reach
@@ -85,11 +87,3 @@ def plot(
         emit(visible(str(target)))
 
     return Answer(PlottedTrace(str(path), str(target), drawn.shown), show)
-
-
-def _target(output: Path | None, trace: Path) -> Path:
-    target = output or trace.with_suffix(".svg")
-    if target.suffix not in _FORMATS:
-        advice = (f"its suffix is one of {' '.join(_FORMATS)}",)
-        raise usage(f"`{target}` is no picture", *advice)
-    return target

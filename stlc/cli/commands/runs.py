@@ -107,7 +107,12 @@ def list_(
         else:
             say(f"there is no run in {runs}; train one: stlc train specs/traffic.stl --system car.yaml")
 
-    return Answer(RunList([_listed(*each) for each in found]), show)
+    listed = []
+    for run, record, status in found:
+        facts = {name: record.get(name) for name in ("spec", "system_path", "steps", "seed", "started")}
+        name = f"{run.path.parent.name}/{run.name}"
+        listed.append(ListedRun(name, run.shown, status, _accuracy(record), **facts))
+    return Answer(RunList(listed), show)
 
 
 @subcommand(GROUP, "show", "stlc runs show latest")
@@ -248,11 +253,6 @@ def _steps(run: RunDir, record: Mapping[str, Any], status: str) -> str:
         done = [row["step"] for row in run.rows() if isinstance(row.get("step"), int)]
         return f"{done[-1] if done else 0} of {planned}"
     return planned
-
-
-def _listed(run: RunDir, record: Mapping[str, Any], status: str) -> ListedRun:
-    facts = {name: record.get(name) for name in ("spec", "system_path", "steps", "seed", "started")}
-    return ListedRun(f"{run.path.parent.name}/{run.name}", run.shown, status, _accuracy(record), **facts)
 
 
 _VOLATILE = ("started", "finished", "command", "result.seconds", "seconds")

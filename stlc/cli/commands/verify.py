@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -17,7 +17,6 @@ from stlc.escape import visible
 
 if TYPE_CHECKING:
     from stlc.assurance.verification.verified import Verified
-    from stlc.assurance.verification.verify import Verification
 
 OPTIONS = VerifyOptions()
 _MOST = 3
@@ -57,28 +56,24 @@ def verify(
     from stlc.assurance.verification.verified import verify as prove
 
     found = prove(run, **options.given())
-    lost = (_lost(found.lost),) if found.lost else ()
+    lost: tuple[Diagnostic, ...] = ()
+    if found.lost:
+        count = f"{len(found.lost):,} batch{'es' if len(found.lost) > 1 else ''} of boxes"
+        message = f"{count} stayed open: lost with the processes that examined them"
+        lost = (Diagnostic("R406", message, note=tuple(dict.fromkeys(found.lost))),)
+    verification = found.found
+    if fail_under is not None:
+        code = 0 if verification.proved >= fail_under else 1 if 1.0 - verification.refuted < fail_under else 4
+    elif any(each.witness is not None for each in verification.modes):
+        code = 1
+    else:
+        code = 4 if verification.open > 0.0 else 0
 
     def show() -> None:
         show_diagnostics(lost)
         emit("\n".join(_lines(found)))
 
-    return Answer(found, show, _exit_code(found.found, fail_under), lost)
-
-
-def _lost(reasons: Sequence[str]) -> Diagnostic:
-    """The finding R406 about batches of boxes that were lost with their processes."""
-    count = f"{len(reasons):,} batch{'es' if len(reasons) > 1 else ''} of boxes"
-    message = f"{count} stayed open: lost with the processes that examined them"
-    return Diagnostic("R406", message, note=tuple(dict.fromkeys(reasons)))
-
-
-def _exit_code(found: Verification, fail_under: float | None) -> int:
-    if fail_under is not None:
-        return 0 if found.proved >= fail_under else 1 if 1.0 - found.refuted < fail_under else 4
-    if any(each.witness is not None for each in found.modes):
-        return 1
-    return 4 if found.open > 0.0 else 0
+    return Answer(found, show, code, lost)
 
 
 def _lines(told: Verified) -> Iterator[str]:

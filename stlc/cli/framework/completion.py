@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -38,10 +38,20 @@ def requirement_names(context: typer.Context, incomplete: str) -> list[str]:
     a trace, they are those of the specification stored in the trace.
     """
     names: dict[str, None] = {}
-    for path in _named(context):
+    given = list(context.args)  # parameters of an incomplete line are not assigned yet
+    for key in ("spec", "files", "what"):
+        value = context.params.get(key)
+        given += [str(item) for item in (value if isinstance(value, list | tuple) else [value]) if item]
+    for path in sorted(map(Path, given), key=lambda path: path.suffix not in (".stl", ".stlc")):
         with suppress(Exception):  # no diagnostics during completion
-            text = _COMMENT.sub("", _specification(path))
-            names |= dict.fromkeys(name.strip("`") for name in _REQUIRE.findall(text))
+            if File(path).is_spec:
+                text = File(path).read().text
+            else:
+                from stlc.trace import read_recording
+
+                text = read_recording(File(path).trace()).meta.carried.text
+            found = _REQUIRE.findall(_COMMENT.sub("", text))
+            names |= dict.fromkeys(name.strip("`") for name in found)
         if names:
             break
     return _fitting(names, incomplete)
@@ -54,21 +64,3 @@ def _fitting(names: Iterable[str], incomplete: str) -> list[str]:
     """
     plain = (name for name in dict.fromkeys(names) if shell((name,)) == name and not name.startswith("-"))
     return [name for name in plain if name.startswith(incomplete)]
-
-
-def _named(context: typer.Context) -> Iterator[Path]:
-    """Paths of the files named on the command line, specifications first."""
-    given = list(context.args)  # parameters of an incomplete line are not assigned yet
-    for key in ("spec", "files", "what"):
-        value = context.params.get(key)
-        given += [str(item) for item in (value if isinstance(value, list | tuple) else [value]) if item]
-    return iter(sorted(map(Path, given), key=lambda path: path.suffix not in (".stl", ".stlc")))
-
-
-def _specification(path: Path) -> str:
-    """The text of a specification file, or of the specification stored in a trace."""
-    if File(path).is_spec:
-        return File(path).read().text
-    from stlc.trace import read_recording
-
-    return read_recording(File(path).trace()).meta.carried.text

@@ -54,7 +54,13 @@ def report(error: BaseException, argv: Sequence[str]) -> int:
             return _stopped(INTERRUPTED, argv)
         case typer.Abort() if not isinstance(error.__cause__, EOFError):
             return _stopped(INTERRUPTED, argv)
-    known = _known(error) or _crash(error, argv)
+    known = _known(error)
+    if known is None:
+        headline = "".join(traceback.format_exception_only(error)).strip().splitlines()[-1]
+        path = _write_report(error, argv)
+        note = "no crash report could be written" if path is None else f"the crash report is {path}"
+        advice = () if path is None else ("report it with that file",)
+        known = BugError.of("B001", f"a bug in stlc: {headline}", note=(note,), help=advice)
     if wants_json(argv):
         Document(_schema(argv), known.exit_code, known.diagnostics).print()
     else:
@@ -133,14 +139,6 @@ def _usage(error: BaseException) -> StlcError:
     if present != former and any(present in param.opts for param in context.command.params):
         return usage(f"{former} is now called {present}", f"{command} {present} …")
     return usage(lowered, f"{command} --help")
-
-
-def _crash(error: BaseException, argv: Sequence[str]) -> StlcError:
-    headline = "".join(traceback.format_exception_only(error)).strip().splitlines()[-1]
-    path = _write_report(error, argv)
-    note = "no crash report could be written" if path is None else f"the crash report is {path}"
-    advice = () if path is None else ("report it with that file",)
-    return BugError.of("B001", f"a bug in stlc: {headline}", note=(note,), help=advice)
 
 
 def _write_report(error: BaseException, argv: Sequence[str]) -> Path | None:

@@ -436,7 +436,10 @@ def _params(command: Any) -> Iterator[Any]:
         entry = queue.pop()
         queue.extend(getattr(entry, "commands", {}).values())
         yield from getattr(entry, "params", ())
-        yield from _help_option(entry)
+        if hasattr(entry, "get_help_option"):  # it creates the option on first use, and keeps it
+            option = entry.get_help_option(typer.Context(entry, help_option_names=list(HELP_NAMES)))
+            if option is not None:
+                yield option
 
 
 def name_values(command: Any) -> None:
@@ -471,17 +474,6 @@ def spare_adapters(command: Any) -> None:
     for param in _params(command):
         if getattr(param, _SLOT, param) is None and hasattr(param, "type_descriptor"):
             setattr(param, _SLOT, _AsGiven())
-
-
-def _help_option(command: Any) -> list[Any]:
-    """The option `--help` of a command as a list; empty if it has none.
-
-    The command creates the option on first use; it is then cached.
-    """
-    if not hasattr(command, "get_help_option"):
-        return []
-    option = command.get_help_option(typer.Context(command, help_option_names=list(HELP_NAMES)))
-    return [] if option is None else [option]
 
 
 class _AsGiven:

@@ -60,14 +60,17 @@ class _Mark:
 def render_text(diagnostics: Iterable[Diagnostic], *, color: bool) -> str:
     """Findings as text, with an empty line between two findings and a line break at the end."""
     paint = Paint(color)
-    blocks = ["\n".join(_block(diagnostic, paint)) for diagnostic in diagnostics]
+    blocks = []
+    for each in diagnostics:
+        title = f"{each.severity}[{each.code}]"
+        head = f"{paint(each.severity, title)}{paint('headline', f': {visible(each.message)}')}"
+        marks = [_Mark(label.span, label.text, primary=False) for label in each.labels]
+        marks = [] if each.span is None else [_Mark(each.span, each.label, primary=True), *marks]
+        fixes = [("fix", each.fix.text)] if each.fix is not None and each.fix.text else []
+        helps, notes = (("help", entry) for entry in each.help), (("note", entry) for entry in each.note)
+        body = _body(marks, (*helps, *fixes, *notes), paint, each.severity)
+        blocks.append("\n".join((head, *body)))
     return "\n\n".join(blocks) + "\n" if blocks else ""
-
-
-def _block(diagnostic: Diagnostic, paint: Paint) -> Iterator[str]:
-    title = f"{diagnostic.severity}[{diagnostic.code}]"
-    yield f"{paint(diagnostic.severity, title)}{paint('headline', f': {visible(diagnostic.message)}')}"
-    yield from _body(_marks(diagnostic), _advice(diagnostic), paint, diagnostic.severity)
 
 
 def render_place(
@@ -94,20 +97,6 @@ def _body(
         first, *more = (visible(line) for line in entry.split("\n"))
         yield f"{margin}{paint('frame', '=')} {paint('help', f'{word}:')} {first}"
         yield from (f"{margin}  {' ' * len(word)}  {line}" for line in more)
-
-
-def _advice(diagnostic: Diagnostic) -> Iterator[tuple[str, str]]:
-    yield from (("help", entry) for entry in diagnostic.help)
-    if diagnostic.fix is not None and diagnostic.fix.text:
-        yield "fix", diagnostic.fix.text
-    yield from (("note", entry) for entry in diagnostic.note)
-
-
-def _marks(diagnostic: Diagnostic) -> list[_Mark]:
-    if diagnostic.span is None:
-        return []
-    primary = _Mark(diagnostic.span, diagnostic.label, primary=True)
-    return [primary, *(_Mark(label.span, label.text, primary=False) for label in diagnostic.labels)]
 
 
 # ---------------------------------------------------------------------- snippets

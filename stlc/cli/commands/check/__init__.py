@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from io import BufferedReader
 
     from stlc.assurance.certificate import Assessment, BoundedVerdict, JudgedFiles, Unjudged
-    from stlc.cli.commands.check.evidence import Repetition
     from stlc.cli.commands.check.many import Outcome
     from stlc.monitor.check import Question
     from stlc.monitor.judgement import Verdict
@@ -114,12 +113,17 @@ def check(
     """
     from stlc.cli.commands.check.many import Work, all_outcomes, exit_code, out_paths
 
-    repetition = None if again is None else _repetition(again, files)
-    if repetition is None:
+    if again is None:
+        repetition = None
         spec, names = _split_files(files or [], judging.spec)
         traces = _expanded(names, [path for path in (table, out) if path is not None])
         judging = replace(judging, spec=spec)
     else:
+        from stlc.cli.commands.check.evidence import Repetition
+
+        if files:
+            raise usage("`--again` judges the files of the stored result", f"stlc check --again {again}")
+        repetition = Repetition(again)
         spec, traces, judging = None, repetition.traces, repetition.options
     if table is not None:
         from stlc.cli.commands.check.table import require_table, write_table
@@ -229,15 +233,6 @@ def _tell(decision: Decision, online: Online) -> None:
     judged = f", judged from t = {decision.time:.10g} s" if asked.everywhere else ""
     now = f"t = {online.time(decision.sample):.10g} s"
     emit(f"{now}  {visible(decision.requirement)}  {WORDS[decision.status]}  {value}{judged}")
-
-
-def _repetition(result: Path, files: Sequence[str] | None) -> Repetition:
-    """The stored result that `--again` names. Raises UsageError (U101) if files are named beside it."""
-    from stlc.cli.commands.check.evidence import Repetition
-
-    if files:
-        raise usage("`--again` judges the files of the stored result", f"stlc check --again {result}")
-    return Repetition(result)
 
 
 def _require_alone(

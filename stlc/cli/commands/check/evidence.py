@@ -86,7 +86,12 @@ class Repetition:
             self.options = Judging.from_words(evidence[0].options)
             self.traces = [each.trace.path for each in evidence]
             for file in {each.path: each for e in evidence for each in (e.trace, *e.inputs)}.values():
-                _require_same(path, file.path, file.sha256)
+                found = Path(file.path)
+                if not (found.is_file() or found.is_dir()):
+                    message = f"`{file.path}`, from which {path} was made, is not here"
+                    raise usage(message, "run it in the folder of the first check", code="U102")
+                if _file(found).sha256 != file.sha256:
+                    raise usage(f"`{file.path}` has changed since {path} was made", code="U102")
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise usage(f"`{path}` holds no evidence of a result: {error}", "stlc check … --json") from None
 
@@ -123,13 +128,3 @@ def _result(path: Path) -> Mapping[str, Any]:
         message = f"`{path}` is no output of `stlc check --json`: {error}"
         raise usage(message, "stlc check SPEC TRACE --json > RESULT.json") from None
     return result
-
-
-def _require_same(result: Path, name: str, digest: str) -> None:
-    """Raise UsageError (U102) unless there is a file or folder `name` with this hash."""
-    path = Path(name)
-    if not (path.is_file() or path.is_dir()):
-        message = f"`{name}`, from which {result} was made, is not here"
-        raise usage(message, "run it in the folder of the first check", code="U102")
-    if _file(path).sha256 != digest:
-        raise usage(f"`{name}` has changed since {result} was made", code="U102")

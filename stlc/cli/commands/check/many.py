@@ -189,12 +189,14 @@ def _judged(works: Sequence[Work], jobs: int, cluster: str | None) -> Iterator[t
     from stlc.controller.parallel import workers_of
     from stlc.controller.parallel.workers import CallFiles, LostCall
 
-    sent: Sequence[Work] = works
+    sent = [*works]
     texts: Sequence[Path] = ()
     if cluster is not None:
-        sent = [replace(work, name=_seen(work)) for work in works]
         from stlc.controller.problem.inputs import input_files
 
+        for index, work in enumerate(works):
+            with suppress(StlcError):  # as named if there is no such file
+                sent[index] = replace(work, name=str(File(work.name).seen(work.runs)))
         question = works[0].question
         if question.spec is not None:
             texts = input_files(question.spec, question.system, question.overrides)
@@ -217,13 +219,6 @@ def _lost(work: Work, lost: LostCall) -> Outcome:
         help=("--chunk reads a large file in pieces", f"stlc check … {operand(work.name)} judges it alone"),
     )
     return Outcome(work.name, errors=(finding,), exit_code=MissingError.exit_code, lost=True)
-
-
-def _seen(work: Work) -> str:
-    """Path of a file, which may lie in the newest run; the name as given if there is no such file."""
-    with suppress(StlcError):
-        return str(File(work.name).seen(work.runs))
-    return work.name
 
 
 def safe_outcomes(work: Work) -> list[Outcome]:

@@ -36,7 +36,11 @@ def verdict_text(verdict: Verdict, replay: Sequence[str], *, color: bool) -> str
     size = f"{verdict.traces} trace{yes} x {about.samples} samples, dt {about.dt or 0.0:g} s"
     title = f"{visible(about.source.name)} on {visible(about.trace)}    {size}"
     least = "robustness (min over traces)" if several else "robustness"
-    cells = [_cells(row, verdict) for row in verdict]
+    cells = []
+    for row in verdict:
+        share = "" if row.holds.size == 1 and row.instants == 1 else percent(row.share)
+        where = "; ".join(filter(None, (row.where, *remarks_of(row))))
+        cells.append((row.name, words_of(row), robustness_of(row, verdict), share, where))
     rows = table(cells, header=("requirement", "verdict", least, "starts", "where")).split("\n")
     red = Paint(color)("error", WORDS["violated"])
     body = (
@@ -60,12 +64,6 @@ def verdict_text(verdict: Verdict, replay: Sequence[str], *, color: bool) -> str
     if (folder / "run.json").is_file():
         lines.append(f"next: {shell(('stlc', 'report', str(folder)))}")
     return "\n".join(lines)
-
-
-def _cells(row: RequirementVerdict, verdict: Verdict) -> tuple[str, ...]:
-    share = "" if row.holds.size == 1 and row.instants == 1 else percent(row.share)
-    where = "; ".join(filter(None, (row.where, *remarks_of(row))))
-    return row.name, words_of(row), robustness_of(row, verdict), share, where
 
 
 def words_of(row: RequirementVerdict) -> str:

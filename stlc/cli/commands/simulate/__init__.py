@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 from stlc.activity import PULSE
@@ -15,7 +14,7 @@ from stlc.diagnostics import usage
 from stlc.jsontext import plain
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from stlc.assurance.plant_judge import PlantSimulation
     from stlc.assurance.simulated import Simulation
@@ -87,7 +86,7 @@ def simulate(
             seen, lambda: plant.show(seen, run, options.overrides), plant.exit_code(seen, fail_under)
         )
     from stlc.assurance.simulated import simulation
-    from stlc.cli.commands.certify.text import require_claim
+    from stlc.cli.commands.certify.text import bounds_lines, require_claim
     from stlc.cli.commands.simulate import text
     from stlc.cli.commands.simulate.watch import Watching, require_writable
     from stlc.view.simulated import pictures
@@ -100,8 +99,12 @@ def simulate(
     guard = options.guarded
     if not json:  # before the pictures, so that they do not affect the measurements
         record: Any = plain(found)
-        for line in chain(text.screen(record, windows=screen.windows), _bounds_shown(found, guard)):
+        for line in text.screen(record, windows=screen.windows):
             printed(line)
+        for name, each in zip(("", *found.scenarios), found.under(guard), strict=True):
+            if each.assurance is not None:
+                for line in (f"\n  {name}" if name else "", *bounds_lines(each.assurance)):
+                    printed(line)
     drawn = pictures(opened) if options.pictures else {}
 
     def show() -> None:
@@ -131,15 +134,6 @@ def _printed(*, json: bool, margins: str | None) -> Callable[[str], None]:
         message = "`--json` and `--robustness -` both want the standard output"
         raise usage(message, "--robustness robustness.jsonl")
     return say
-
-
-def _bounds_shown(found: Simulation, guard: str) -> Iterator[str]:
-    from stlc.cli.commands.certify.text import bounds_lines
-
-    for name, each in zip(("", *found.scenarios), found.under(guard), strict=True):
-        if each.assurance is not None:
-            yield f"\n  {name}" if name else ""
-            yield from bounds_lines(each.assurance)
 
 
 def _require_robots(task: Task) -> None:

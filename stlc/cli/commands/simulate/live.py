@@ -113,7 +113,11 @@ class LiveView:
     def panel(self) -> Group:
         """The present state of the deployment as drawn on the terminal."""
         width, height = self.console.size
-        lines = [Text(self.title, style="bold"), Text(f"{self._counter()}   {self._decisions()}"), Text()]
+        counts = self.monitor.counts.tolist()
+        total = max(sum(counts), 1)
+        shares = (f"{name} {percent(n / total)}" for name, n in zip(SOURCES, counts, strict=True) if n)
+        decisions = "   ".join(shares)
+        lines = [Text(self.title, style="bold"), Text(f"{self._counter()}   {decisions}"), Text()]
         lines += self._bars(width)
         lines.append(Text())
         lines += self._agents(width, max(height - len(lines) - 2, 3))
@@ -126,11 +130,6 @@ class LiveView:
         assert moment is not None
         step = f"step {moment.step:,} / {moment.steps:,}   t = {self.monitor.time:.6g} s"
         return f"{step}   all decided in {1e3 * self._seconds:.1f} ms"
-
-    def _decisions(self) -> str:
-        total = max(int(self.monitor.counts.sum()), 1)
-        shares = zip(SOURCES, self.monitor.counts.tolist(), strict=True)
-        return "   ".join(f"{name} {percent(count / total)}" for name, count in shares if count)
 
     def _agent(self, row: int) -> str:
         seed, agent = divmod(row, self.monitor.setting.agents)

@@ -42,17 +42,12 @@ def show(found: PlantSimulation, spec: str, overrides: Mapping[str, str]) -> Non
     emit(_summary(found))
     if found.trace is not None:
         say(f"the traces are in {found.trace}")
-        emit(
-            f"next: {shell(('stlc', 'check', *_judging(found.trace, spec, overrides), operand(found.trace)))}"
-        )
-
-
-def _judging(trace: str, spec: str, overrides: Mapping[str, str]) -> tuple[str, ...]:
-    """Words that name the specification for `stlc check`; none if the file of the traces carries it."""
-    if trace.endswith(CARRYING):
-        return ()
-    changed = (word for name, value in overrides.items() for word in ("--set", f"{name}={value}"))
-    return (*changed, operand(spec))
+        words: list[str] = []
+        if not found.trace.endswith(CARRYING):  # then the file of the traces carries the specification
+            for name, value in overrides.items():
+                words += ["--set", f"{name}={value}"]
+            words.append(operand(spec))
+        emit(f"next: {shell(('stlc', 'check', *words, operand(found.trace)))}")
 
 
 def _rows(found: PlantSimulation) -> Iterator[tuple[str, ...]]:

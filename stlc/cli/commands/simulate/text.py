@@ -38,7 +38,9 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
     world = document["world"] or f"{document['system']} and its events"
     scenario = [f"scenario {document['scenario']}"] if document["scenario"] else []
     yield visible(" · ".join((document["spec"], f"run {document['run']}", f"world {world}", *scenario, size)))
-    yield from _starts(document)
+    known = {"savable": "a safe plan", "feasible": "a plan that satisfies everything"}.get(document["starts"])
+    if known:
+        yield f"  starts from which {known} is known; {document['redrawn']:,} others were drawn again"
     yield from _wrong(document.get("errors", {}))
     if document.get("margin"):
         margins = ", ".join(f"{name} {margin:.3g}" for name, margin in document["margin"].items())
@@ -57,17 +59,13 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
     yield from _broken(name, last["drives"], judged="" if document["judge"] else "judged from ")
     if windows and document.get("safety", True):
         yield f"  {_unsafe(last['unsafe'], seeds * agents)}"
-    if windows:
-        yield from _model_consistent(last["metrics"].get("foreseen"))
+    foreseen = last["metrics"].get("foreseen") if windows else None
+    if foreseen and (mean := foreseen["mean"]) > 0:
+        beyond = "; the others contain exogenous events" if mean < 1 else ""
+        part = f"the {_part(mean)} of starts from which the world did as the model says"
+        yield f"  model-consistent: {part}{beyond}"
     if document.get("scenarios"):
         yield from compared(document, windows=windows)
-
-
-def _starts(document: Record) -> Iterator[str]:
-    """Yield a line on the choice of initial states; none if every sampled state was used."""
-    known = {"savable": "a safe plan", "feasible": "a plan that satisfies everything"}.get(document["starts"])
-    if known:
-        yield f"  starts from which {known} is known; {document['redrawn']:,} others were drawn again"
 
 
 def _drives(document: Record) -> Iterator[str]:
@@ -116,13 +114,6 @@ def _broken(guard: str, drives: Record, judged: str) -> Iterator[str]:
     more = len(drives["broken"]) - MOST_BROKEN
     if more > 0:
         yield f"{violated}: {more} more, see eval/simulate.json"
-
-
-def _model_consistent(share: Record | None) -> Iterator[str]:
-    if share and share["mean"] > 0:
-        part = _part(share["mean"])
-        beyond = "; the others contain exogenous events" if share["mean"] < 1 else ""
-        yield f"  model-consistent: the {part} of starts from which the world did as the model says{beyond}"
 
 
 def _wrong(errors: Mapping[str, Any]) -> Iterator[str]:

@@ -55,32 +55,26 @@ class Watching:
 
         monitor = LiveMonitor(task, setting)
         with ExitStack() as stack:
-            listeners: list[Callable[[], None]] = []
+            listeners: list[Watch] = []
             if margins is not None:
                 lines = stack.enter_context(_lines(margins))
-                listeners.append(lambda: _write(monitor, lines))
+                listeners.append(lambda _: _write(monitor, lines))
             if self.live:
                 from stlc.cli.commands.simulate.live import LiveView
 
                 view = LiveView(monitor, title, console(stderr=True))
                 stack.callback(view.stop)
                 view.start()
-                listeners.append(view.update)
+                listeners.append(lambda _: view.update())
             else:
-                update = stack.enter_context(bar(title, console(stderr=True)))
-                listeners.append(lambda: update(_present(monitor)))
+                listeners.append(stack.enter_context(bar(title, console(stderr=True))))
 
             def watch(moment: SimulationStep) -> None:
                 monitor.push(moment)
                 for listener in listeners:
-                    listener()
+                    listener(moment)
 
             yield watch
-
-
-def _present(monitor: LiveMonitor) -> SimulationStep:
-    assert monitor.moment is not None
-    return monitor.moment
 
 
 def require_writable(where: str | None) -> None:

@@ -115,14 +115,29 @@ def train_many(many: Many) -> Answer[TrainedRuns]:
         jobs = [many.job(part) for part in many.parts]
         for ended in processes.run(jobs, lambda job: say(f"{job.name} {started}")):
             found[ended.job.name] = ended
-            for line in _line(ended).splitlines():
+            accuracy = ended.result.get("accuracy")
+            if accuracy is None:
+                text = f"{ended.job.name} broke off with exit code {ended.code}\n{ended.why}".rstrip()
+            else:
+                text = f"{ended.job.name} done: accuracy {accuracy:.4f}  {ended.result['run']}"
+            for line in text.splitlines():
                 say(line)
     except (KeyboardInterrupt, SystemExit):
         say(f"interrupted; runs that were going are saved: stlc runs list --runs {many.launch.root}")
         raise
     records = [_record(part, found[many.name(part)]) for part in many.parts]
     code = max(each.exit_code if each.exit_code >= 0 else ENDED for each in records)
-    return Answer(TrainedRuns(records), lambda: emit(_table(records, several=len(many.specs) > 1)), code)
+
+    def show() -> None:
+        several = len(many.specs) > 1
+        rows: list[tuple[str, ...]] = []
+        for spec, group in groupby(records, key=lambda record: record.spec):
+            own = list(group)
+            lines = [*map(_cells, own), *_mean(own)]
+            rows += [(spec, *line) if several else line for line in lines]
+        emit(table(rows, header=("specification", *HEADER) if several else HEADER, indent=""))
+
+    return Answer(TrainedRuns(records), show, code)
 
 
 def _record(part: Part, ended: JobResult) -> TrainedJob:
@@ -133,27 +148,6 @@ def _record(part: Part, ended: JobResult) -> TrainedJob:
     return TrainedJob(
         str(part.spec), part.seed, ended.code, trained=replace(run, judged=JudgedTraining(**facts))
     )
-
-
-def _line(ended: JobResult) -> str:
-    """The message that is printed when a run has ended."""
-    accuracy = ended.result.get("accuracy")
-    if accuracy is None:
-        return f"{ended.job.name} broke off with exit code {ended.code}\n{ended.why}".rstrip()
-    return f"{ended.job.name} done: accuracy {accuracy:.4f}  {ended.result['run']}"
-
-
-def _table(records: Sequence[TrainedJob], *, several: bool) -> str:
-    """Text table of trained runs, one row per run.
-
-    A row with the mean follows the runs of each specification that was trained several times.
-    """
-    rows: list[tuple[str, ...]] = []
-    for spec, group in groupby(records, key=lambda record: record.spec):
-        own = list(group)
-        lines = [*map(_cells, own), *_mean(own)]
-        rows += [(spec, *line) if several else line for line in lines]
-    return table(rows, header=("specification", *HEADER) if several else HEADER, indent="")
 
 
 def _cells(record: TrainedJob) -> tuple[str, ...]:

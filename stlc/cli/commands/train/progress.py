@@ -123,7 +123,12 @@ class TrainingDisplay:
         self._row_at = self._clock()
         if self._live is None and self._title and self._row_at - self._line_at >= LINE_EVERY:
             self._line_at = self._row_at
-            self._print(self._line())
+            parts = [self._counter(), self._time_left(), f"plan accuracy {'  '.join(self._accuracy_parts())}"]
+            requirements: Mapping[str, float] = self._row.get("requirements") or {}
+            if requirements:
+                worst = min(requirements, key=requirements.__getitem__)
+                parts.append(f"worst {worst} {requirements[worst]:.3f}")
+            self._print("  " + "   ".join(part for part in parts if part))
 
     def stop(self) -> None:
         """Close the panel and restore the terminal; a second call has no effect."""
@@ -139,7 +144,12 @@ class TrainingDisplay:
         self.stop()
         console = to or self.console
         for line in lines:
-            console.print(_emphasised(_folded(self._plain(line), console, 16)), soft_wrap=True)
+            text = Text(folded := _folded(self._plain(line), console, 16))
+            if folded.startswith(("closed loop", "Next:")):
+                text.stylize("bold", 0, len(folded))
+            elif folded.startswith("plan accuracy"):
+                text.stylize("bold", 0, 25)
+            console.print(text, soft_wrap=True)
 
     @property
     def spark(self) -> str:
@@ -184,26 +194,16 @@ class TrainingDisplay:
                 parts.append(f"share {percent(accuracy / feasible)}")
         return parts
 
-    def _line(self) -> str:
-        parts = [self._counter(), self._time_left(), f"plan accuracy {'  '.join(self._accuracy_parts())}"]
-        requirements: Mapping[str, float] = self._row.get("requirements") or {}
-        if requirements:
-            worst = min(requirements, key=requirements.__getitem__)
-            parts.append(f"worst {worst} {requirements[worst]:.3f}")
-        return "  " + "   ".join(part for part in parts if part)
-
-    def _accuracy_line(self, width: int) -> str:
-        """Line with the accuracy and its bar chart, which is narrower in a narrow terminal."""
-        figures = "     ".join(self._accuracy_parts())
-        room = min(SPARK_WIDTH, width - len(figures) - 22)
-        spark = sparkline(self._accuracies, width=room, blocks=self._blocks) if room >= 4 else ""
-        return f"  plan accuracy   {spark}  {figures}" if spark else f"  plan accuracy   {figures}"
-
     def panel(self) -> Group:
         """The panel as it is drawn at present."""
         width = self.console.width
-        lines = [*_spread(self._title, f"{self._counter()}   {self._time_left()}".rstrip(), width)]
-        lines.append(self._accuracy_line(width))
+        left, right = self._title, f"{self._counter()}   {self._time_left()}".rstrip()
+        gap = width - len(left) - len(right)
+        lines = [left + " " * gap + right] if gap >= 3 else [left, "  " + right]
+        figures = "     ".join(self._accuracy_parts())
+        room = min(SPARK_WIDTH, width - len(figures) - 22)
+        spark = sparkline(self._accuracies, width=room, blocks=self._blocks) if room >= 4 else ""
+        lines.append(f"  plan accuracy   {spark}  {figures}" if spark else f"  plan accuracy   {figures}")
         cells = [f"{name}  {share:.3f}" for name, share in (self._row.get("requirements") or {}).items()]
         lines.extend(_packed(cells, width))
         if self._row.get("failing") is not None:
@@ -224,12 +224,6 @@ def _folded(text: str, console: Console, indent: int) -> str:
     return textwrap.fill(
         text, console.width, subsequent_indent=beneath, break_long_words=False, break_on_hyphens=False
     )
-
-
-def _spread(left: str, right: str, width: int) -> tuple[str, ...]:
-    """Return one line with `left` and `right` at its two ends; two lines if they do not fit into `width`."""
-    gap = width - len(left) - len(right)
-    return (left + " " * gap + right,) if gap >= 3 else (left, "  " + right)
 
 
 def _packed(cells: list[str], width: int) -> list[str]:
@@ -344,12 +338,3 @@ def final_screen(
         for above, (label, text) in zip(labels, rows, strict=False)
     ]
     return lines if verdict is None else [*lines, "", f"Next:  {verdict.command}"]
-
-
-def _emphasised(line: str) -> Text:
-    text = Text(line)
-    if line.startswith(("closed loop", "Next:")):
-        text.stylize("bold", 0, len(line))
-    elif line.startswith("plan accuracy"):
-        text.stylize("bold", 0, 25)
-    return text
