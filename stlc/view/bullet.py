@@ -139,15 +139,19 @@ class Renderer:
     def turn(self, index: int, who: NDArray[np.int64]) -> None:
         """Show frame `index`.
 
-        The colour of a robot depends on the source of its decision. `who`, (robots,), contains the sources: 0
-        is the policy, any other number a stage of the guard.
+        The colour of the disc under a robot depends on the source of its decision. `who`, (robots,), contains
+        the sources: 0 is the policy, any other number a stage of the guard. If the guard made the decision,
+        the robot itself gets the same colour. Otherwise it is white.
         """
         self.client.configureDebugVisualizer(self.client.COV_ENABLE_RENDERING, 0)  # until all is in place
         for robot, body in enumerate(self.robots):
             angles = self.stage.joints[index, robot, :, None].tolist()
             self.client.resetJointStatesMultiDof(body, self.movable, angles)
             if self.shown[robot] != who[robot]:
-                self._colour(robot, int(who[robot]))
+                color = _rgba(DECIDED[int(who[robot])])
+                self.client.changeVisualShape(self.discs[robot], -1, rgbaColor=color)
+                for link in self.links:
+                    self.client.changeVisualShape(body, link, rgbaColor=color if who[robot] else _WHITE)
         for ball, bodies in zip(self.stage.balls, self.balls, strict=True):
             for robot, body in enumerate(bodies):
                 self._put(body, self.places[robot] + ball.centre[index, robot])
@@ -194,16 +198,6 @@ class Renderer:
             rgbaColor=_rgba(ball.color, self.clear),
         )
         return int(self.client.createMultiBody(0, -1, shape))
-
-    def _colour(self, robot: int, source: int) -> None:
-        """Colour the disc under a robot by the source of its decision.
-
-        If the guard made the decision, the robot itself gets the same colour. Otherwise it is white.
-        """
-        self.client.changeVisualShape(self.discs[robot], -1, rgbaColor=_rgba(DECIDED[source]))
-        body = _WHITE if source == 0 else _rgba(DECIDED[source])
-        for link in self.links:
-            self.client.changeVisualShape(self.robots[robot], link, rgbaColor=body)
 
     def _put(self, body: int, place: NDArray[np.float64]) -> None:
         self.client.resetBasePositionAndOrientation(body, place.tolist(), (0, 0, 0, 1))
@@ -291,8 +285,12 @@ def with_visuals(urdf: Path, meshes: Mapping[str, str], folder: Path) -> Path:
             inertial = ElementTree.SubElement(link, "inertial")
             ElementTree.SubElement(inertial, "mass", value="1")
             ElementTree.SubElement(inertial, "inertia", attrib=_UNIT_MASS)
-        mesh = _mesh(meshes.get(name))
-        if mesh is not None:
+        mesh = None
+        if name in meshes:
+            import pybullet_data
+
+            mesh = Path(pybullet_data.getDataPath()) / meshes[name]
+        if mesh is not None and mesh.is_file():
             geometry = ElementTree.SubElement(ElementTree.SubElement(link, "visual"), "geometry")
             ElementTree.SubElement(geometry, "mesh", filename=str(mesh))
             continue
@@ -301,15 +299,6 @@ def with_visuals(urdf: Path, meshes: Mapping[str, str], folder: Path) -> Path:
     path = folder / "robot.urdf"
     ElementTree.ElementTree(robot).write(path, encoding="utf-8")
     return path
-
-
-def _mesh(name: str | None) -> Path | None:
-    if name is None:
-        return None
-    import pybullet_data
-
-    path = Path(pybullet_data.getDataPath()) / name
-    return path if path.is_file() else None
 
 
 def _ends(robot: ElementTree.Element) -> dict[str, list[tuple[float, float, float]]]:

@@ -10,7 +10,7 @@ from stlc.diagnostics import StlcError
 from stlc.grammar import ast
 from stlc.grammar.spec import Spec
 from stlc.monitor.explain.report import Cause
-from stlc.monitor.judgement import RequirementVerdict, Verdict
+from stlc.monitor.judgement import Verdict
 from stlc.monitor.verdict import Monitor
 from stlc.trace import Trace
 from stlc.view.contents import RunContents, untagged
@@ -111,13 +111,20 @@ def _verdict_table(verdict: Verdict, names: list[str]) -> Html:
     rows: list[tuple[Child, ...]] = []
     for judgement in verdict:
         trace, _ = judgement.worst
+        violated = judgement.overall == "violated"
+        margin = float((judgement.high if violated else judgement.low).min())
+        if np.isfinite(margin):
+            least = f"{margin:+.3f} {judgement.rule.typed.formula.margin_unit}".rstrip()
+            least = least if violated else least.replace("-0.000", "+0.000")
+        else:
+            least = "not limited" if margin > 0 else "unknown"
         violating = judgement.statuses.count("violated")
         rows.append(
             (
                 el("strong", judgement.name),
                 classed("span", _KINDS.get(judgement.overall, "quiet"), judgement.overall),
                 f"{violating:,} of {verdict.traces:,}",
-                _least(judgement),
+                least,
                 ", ".join(filter(None, (names[trace], judgement.when))),
             )
         )
@@ -125,15 +132,6 @@ def _verdict_table(verdict: Verdict, names: list[str]) -> Html:
 
 
 _KINDS = {"satisfied": "good", "violated": "bad"}
-
-
-def _least(judgement: RequirementVerdict) -> str:
-    values = judgement.high if judgement.overall == "violated" else judgement.low
-    least = float(values.min())
-    if not np.isfinite(least):
-        return "not limited" if least > 0 else "unknown"
-    text = f"{least:+.3f} {judgement.rule.typed.formula.margin_unit}".rstrip()
-    return text if judgement.overall == "violated" else text.replace("-0.000", "+0.000")
 
 
 def _caption(trace: Trace, once: list[str]) -> Html:

@@ -198,11 +198,9 @@ def _draw_regions(axes: Axes, region_map: RegionMap) -> list[PathPatch]:
     from matplotlib.path import Path
 
     window = (axes.get_xlim(), axes.get_ylim())
-    areas, sampled = (
-        [],
-        [region_map.plane.sampled(region, region_map.trace, window) for region in region_map.plane.regions],
-    )
-    for index, (region, (xs, ys, depth)) in enumerate(zip(region_map.plane.regions, sampled, strict=True)):
+    areas, regions = [], region_map.plane.regions
+    sampled = [region_map.plane.sampled(region, region_map.trace, window) for region in regions]
+    for index, (region, (xs, ys, depth)) in enumerate(zip(regions, sampled, strict=True)):
         color = region_map.color(region)
         outline = Path(np.empty((0, 2)))
         if (depth >= 0).any():

@@ -173,7 +173,12 @@ def headline(contents: RunContents) -> Html:
     """
     record, result, simulation = contents.record, contents.result, contents.simulation or {}
     driven, viable = satisfied_sentence(simulation), viable_sentence(simulation)
-    verdict = _verdict(contents)
+    accuracy, held_out = result.get("accuracy"), result.get("held_out")
+    if accuracy is None:
+        verdict = f"Training of {contents.spec} is {record.get('status', 'not finished')}"
+    else:
+        starts = f"{held_out:,} held-out starts" if held_out else "held-out starts"
+        verdict = f"The policy's plan satisfies {contents.spec} from {share(accuracy)} of {starts}"
     trial = [] if driven else driven_lines(result)
     names = dict.fromkeys((contents.spec, str(record.get("system", "")), f"run {contents.run.name}"))
     return join(
@@ -184,15 +189,6 @@ def headline(contents: RunContents) -> Html:
         el("p", f"{verdict}. {_beside(result)}" if driven else _beside(result)) if result else None,
         _advice(contents),
     )
-
-
-def _verdict(contents: RunContents) -> str:
-    accuracy = contents.result.get("accuracy")
-    if accuracy is None:
-        return f"Training of {contents.spec} is {contents.record.get('status', 'not finished')}"
-    held_out = contents.result.get("held_out")
-    starts = f"{held_out:,} held-out starts" if held_out else "held-out starts"
-    return f"The policy's plan satisfies {contents.spec} from {share(accuracy)} of {starts}"
 
 
 def _beside(result: Mapping[str, Any]) -> str:
