@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from string import Template
@@ -19,10 +19,10 @@ import torch
 from torch import Tensor
 
 from stlc.compile.augment.timers import Timer
-from stlc.compile.backends.c.emit import CHECK, HEAD, Motion, forward_blocks, passes, state_index
+from stlc.compile.backends.c.emit import CHECK, HEAD, forward_blocks, passes, state_index
 from stlc.compile.backends.c.numbers import NumberWriter, literal
 from stlc.compile.backends.c.parts import declared, in_parts
-from stlc.compile.backends.c.plan import Plan, plan_of
+from stlc.compile.backends.c.plan import plan_of
 from stlc.compile.backends.numbers import Leaf
 from stlc.compile.ir import nodes as ir
 from stlc.compile.pipeline import CompiledRequirement
@@ -85,36 +85,26 @@ def public(texts: Mapping[str, str], guard: str) -> dict[str, str]:
         texts: file name -> text; a name declared in one file is prefixed in all files.
         guard: macro of the include guard. A text with an include guard must end with its `#endif`.
     """
-    names = dict(found for text in texts.values() for found in _renamed(text))
+    names: dict[str, str] = {}
+    for text in texts.values():
+        found = [name for pattern in _DECLARED for name in pattern.findall(text)]
+        macros = _DEFINED.findall(text)
+        names |= {name: PREFIX + name for name in found if not name.startswith(OWN)}
+        names |= {name: PREFIX.upper() + name for name in macros if not name.startswith(OWN)}
     names |= {"restrict": "STLC_RESTRICT", guard: guard}
     written = {file: _TOKEN.sub(lambda token: _written(token, names), text) for file, text in texts.items()}
-    return {file: _framed(text, f"#define {guard}\n") for file, text in written.items()}
-
-
-def _renamed(text: str) -> Iterator[tuple[str, str]]:
-    """Yield each name that a text declares, with its prefixed name."""
-    for pattern in _DECLARED:
-        yield from ((name, PREFIX + name) for name in pattern.findall(text) if not name.startswith(OWN))
-    for name in _DEFINED.findall(text):
-        if not name.startswith(OWN):
-            yield name, PREFIX.upper() + name
+    opening = f"#define {guard}\n"
+    for file, text in written.items():
+        if opening in text:
+            body, end = text.replace(opening, opening + _OPENING, 1).rsplit("#endif", 1)
+            written[file] = f"{body.rstrip()}\n{_CLOSING}\n#endif{end}"
+    return written
 
 
 def _written(token: re.Match[str], names: Mapping[str, str]) -> str:
     if token["hex"]:
         return repr(float.fromhex(token["hex"]))  # C++ knows hexadecimal fractions from C++17 on
     return names.get(token["word"], token[0]) if token["word"] else token[0]
-
-
-def _framed(text: str, guard: str) -> str:
-    """Insert compiler directives (`extern "C"` and the like) after the include guard of a header.
-
-    A text without the include guard is returned unchanged.
-    """
-    if guard not in text:
-        return text
-    body, end = text.replace(guard, guard + _OPENING, 1).rsplit("#endif", 1)
-    return f"{body.rstrip()}\n{_CLOSING}\n#endif{end}"
 
 
 # --------------------------------------------------------------------------------------------- weights
@@ -257,9 +247,14 @@ def header(task: Task, network: PlanProposer) -> str:
     motion = motion_of(task.system)
     judged = plan_of([rule.formula for rule in task.rules], task.horizon + 1)
     falling = plan_of([open_ended(anchored(rule.formula)) for rule in task.compiled.safety], task.horizon + 1)
-    parts = _numbers(task, network) | {
+    numbers, checks = _numbers(task, network), passes(motion, judged)
+    # `fall`: the safety requirements on the first steps of a trajectory; a signal with the index STATES is
+    # positive at the later samples, which count as harmless
+    blocks = forward_blocks(falling, state_index(motion) | {BEYOND: len(motion.states)})
+    fall = in_parts(replace(CHECK, name="fall"), blocks, declared(falling))
+    parts = numbers | {
         "HEAD": HEAD,
-        "PASSES": "\n".join([*passes(motion, judged), *_falling(motion, falling)]),
+        "PASSES": "\n".join([*checks, *fall]),
         "DECISION": decision(),
         "ROOM": max(judged.size, falling.size, 1),
     }
@@ -448,12 +443,3 @@ def _overall(rules: Sequence[CompiledRequirement], among: Sequence[CompiledRequi
         f"least = MIN(least, weighed(each[{names.index(rule.name)}], {literal(rule.factor)}));"
         for rule in rules
     ]
-
-
-def _falling(motion: Motion, plan: Plan) -> list[str]:
-    """C function `fall`: robustness of the safety requirements on the first steps of a trajectory.
-
-    A signal with the index STATES is positive at the later samples, which count as harmless.
-    """
-    blocks = forward_blocks(plan, state_index(motion) | {BEYOND: len(motion.states)})
-    return in_parts(replace(CHECK, name="fall"), blocks, declared(plan))
