@@ -167,7 +167,10 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             self._next = moved.observation
             return final, reward, done, none, end
         info = self._told(self._episodes.states)
-        info |= self._marked({"final_obs": _objects(final), "final_info": end})
+        rows = np.empty(len(final), dtype=object)  # an array of arrays: the form of `final_obs`
+        for i, row in enumerate(final):
+            rows[i] = row
+        info |= self._marked({"final_obs": rows, "final_info": end})
         return self._shown(moved.observation), reward, done, none, info
 
     def _shown(self, seen: Tensor) -> Floats:
@@ -201,14 +204,6 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         For every key `NAME`, the array `_NAME`, (N,), marks the environments for which `NAME` has a value.
         """
         return values | {f"_{name}": self._all for name in values}
-
-
-def _objects(rows: Floats) -> NDArray[np.object_]:
-    """Array of objects, (N,), whose entries are the rows of an array; `final_obs` has this form."""
-    found = np.empty(len(rows), dtype=object)
-    for i, row in enumerate(rows):
-        found[i] = row
-    return found
 
 
 def make_vec(

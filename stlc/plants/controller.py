@@ -64,16 +64,15 @@ class NetworkController:
                 found: Any = self._session.run([self._output], {self._input: given})[0]
             except Exception as error:  # its errors have no common class
                 raise FaultError("crash", f"the controller fails: {str(error)[:500]}") from error
-            self._commands = self._limited(np.asarray(found, dtype=np.float64).reshape(-1))
+            numbers = np.asarray(found, dtype=np.float64).reshape(-1)
+            if numbers.size != len(self._low):
+                message = f"the controller gives {numbers.size} numbers, and `writes` names {len(self._low)}"
+                raise FaultError("wrong shape", message)
+            if not np.isfinite(numbers).all():
+                raise FaultError("not finite", "the controller gives a number that is not finite")
+            scaled = self._declared.scale * numbers + self._declared.offset
+            self._commands = np.clip(scaled, self._low, self._high)
         return self._commands
-
-    def _limited(self, found: Floats) -> Floats:
-        if found.size != len(self._low):
-            message = f"the controller gives {found.size} numbers, and `writes` names {len(self._low)}"
-            raise FaultError("wrong shape", message)
-        if not np.isfinite(found).all():
-            raise FaultError("not finite", "the controller gives a number that is not finite")
-        return np.clip(self._declared.scale * found + self._declared.offset, self._low, self._high)
 
 
 def _shape(shape: list[Any], size: int, name: str) -> tuple[int, ...]:
