@@ -12,7 +12,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
 from itertools import islice
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,8 +120,9 @@ def reading_of(spec: Spec, requested: Reading = AS_IT_IS, read: Collection[str] 
         words[name] = {} if item.type is None else worth.get(item.type.name, {})
         kinds[name] = "real" if item.type is None else _KINDS.get(item.type.name, "enum")
         timelike[name] = not item.unit or Unit.written(item.unit).same_dims(Unit.SYMBOLS["s"])
-        if (declared := _declared_between(item)) is not None:
-            between[name] = declared
+        stated = next((tag for tag in item.tags if tag.name in BETWEEN), None)
+        if stated is not None:  # by `@hold(0.5 s)`, for instance
+            between[name] = _turned(Between(cast(How, stated.name), age_of(stated)), item)
     _require_signals(requested, spec, columns)
     declaration = {item.column or item.name: item for item in reversed(signals)}
     for name, each in requested.between.items():
@@ -146,15 +147,6 @@ def _require_signals(requested: Reading, spec: Spec, columns: Mapping[str, str])
                 findings.append(Diagnostic("U101", message, note=note).near(name, declared))
     if findings:
         raise UsageError(*findings)
-
-
-def _declared_between(item: ast.Signal) -> Between | None:
-    """Values between samples that a tag of a declaration states, such as `@hold(0.5 s)`."""
-    for tag in item.tags:
-        for how in get_args(How):
-            if tag.name == how and how in BETWEEN:
-                return _turned(Between(how, age_of(tag)), item)
-    return None
 
 
 def _turned(between: Between, item: ast.Signal | None) -> Between:
@@ -203,20 +195,23 @@ class Signals:
 
     @property
     def gaps(self) -> dict[str, Gap]:
-        """Unknown samples (NaN) of every signal that contains NaN, by name; {} if arrays are not NumPy."""
+        """Unknown samples (NaN) of signals by name, each within the time in which the signal was seen.
+
+        Signals without any are left out; all are if arrays are not NumPy.
+        """
         if self.ops is not NUMPY:
             return {}
-        found = {name: Gap().with_more(self._unknown(name, values)) for name, values in self.env.items()}
-        return {name: gap for name, gap in found.items() if gap.samples}
-
-    def _unknown(self, name: str, values: Array) -> NDArray[np.bool_]:
-        """Samples at which a signal is unknown although it was seen before and after, (time, batch)."""
-        unknown = np.isnan(values)
-        span = self.spans.get(name)
-        if span is not None and self.dt and unknown.any():
-            times = self.t0 + self.dt * np.arange(self.samples)
-            unknown[(times < span.first) | (times > span.last)] = False
-        return np.asarray(unknown)
+        found: dict[str, Gap] = {}
+        for name, values in self.env.items():
+            unknown = np.isnan(values)
+            span = self.spans.get(name)
+            if span is not None and self.dt and unknown.any():
+                times = self.t0 + self.dt * np.arange(self.samples)
+                unknown[(times < span.first) | (times > span.last)] = False
+            gap = Gap().with_more(unknown)
+            if gap.samples:
+                found[name] = gap
+        return found
 
     def like_given(self, values: Array) -> Array:
         """Reshape values (time, batch) to (…, time), the shape in which the signals were given.

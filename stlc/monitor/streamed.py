@@ -81,7 +81,13 @@ def watched(
     Raises:
         TraceError: a sample lacks a signal, or a value or unit does not fit.
     """
-    changes = _conversions(online, units, name)
+    from stlc.trace.recording import conversion, unit_of
+
+    # conversions from the recorded units to the declared ones
+    columns = [column for column in online.compiled.signature.columns if column.name in units]
+    recorded = {column: unit_of(name, column.name, units[column.name]) for column in columns}
+    converted = {column.name: conversion(name, column, unit) for column, unit in recorded.items()}
+    changes = {signal: change for signal, change in converted.items() if change is not None}
     for samples in uniform.samples:
         try:
             rows = _rows(samples, changes, online)
@@ -100,23 +106,6 @@ def watched(
     message = f"samples of the {name} between the instants of the grid are not judged: {aside:,}"
     finding = Diagnostic("W305", message, help=("stlc check SPEC FILE  judges every sample of a recording",))
     return found.but(about=replace(found.about, warnings=(finding, *found.about.warnings)))
-
-
-def _conversions(online: Online, units: Mapping[str, str], name: str) -> dict[str, Conversion]:
-    """Return the unit conversions of a stream: signal -> function that converts its values.
-
-    `units` gives the unit of each recorded signal. The values are converted to the unit that the
-    specification declares. A signal that needs no conversion is left out.
-
-    Raises:
-        TraceError: E605, a unit is invalid, or has another dimension than the declared one.
-    """
-    from stlc.trace.recording import conversion, unit_of
-
-    columns = [column for column in online.compiled.signature.columns if column.name in units]
-    recorded = {column: unit_of(name, column.name, units[column.name]) for column in columns}
-    found = {column.name: conversion(name, column, unit) for column, unit in recorded.items()}
-    return {signal: change for signal, change in found.items() if change is not None}
 
 
 def _rows(samples: Samples, changes: Mapping[str, Conversion], online: Online) -> NDArray[np.float64]:

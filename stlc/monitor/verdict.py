@@ -41,7 +41,7 @@ from stlc.monitor.instants import (
     starts_of,
     window_of,
 )
-from stlc.monitor.judgement import About, Bools, RequirementVerdict, Verdict, chosen
+from stlc.monitor.judgement import About, RequirementVerdict, Verdict, chosen
 from stlc.monitor.prepared import Part, Prepared
 from stlc.monitor.signals import WHOLE, Excerpt, Need, arrange, needs_of, plain_columns, reading_of
 from stlc.monitor.uncertain import Uncertainties, outer, outer_of, uncertain_record
@@ -187,7 +187,10 @@ class Monitor:
             judgements = [_reported(judgement, ready, ends) for judgement in judgements]
         judgements = [replace(judgement, subject=ready) for judgement in judgements]
         found = Verdict(tuple(judgements), _about(ready), end, uncertain or {}, judged_on=ready)
-        return found.within(_scope(judged, tolerance))
+        scope = np.ones(judged.signals.batch, dtype=bool)  # traces that may satisfy the assumptions
+        for rule in judged.compiled.assumptions:
+            scope &= ~_judge(rule, judged, range(1), "open", tolerance, judged.part(rule)).fails[0]
+        return found.within(scope)
 
     def robustness(
         self,
@@ -273,7 +276,13 @@ class Monitor:
         given, recorded = self._read(subject, require)
         key = (recorded, tuple(require), plain)
         if key not in self._selected:
-            self._selected[key] = _selection(self._ready(recorded), require, plain)
+            compiled = self._ready(recorded)
+            rules, horizon = _chosen(compiled, require), compiled.grid.horizon
+            needs = needs_of(compiled, [*rules, *compiled.assumptions] if plain else rules)
+            spans = (span_of(rule, horizon) for rule in rules)
+            reach = Reach(*map(max, zip(*spans, strict=True)))
+            factors = tuple(rule.factor for rule in rules)
+            self._selected[key] = _Selection(compiled, rules, needs, factors, reach)
         selected = self._selected[key]
         if isinstance(given, Trace):
             require_windows(given, selected.rules)
@@ -395,14 +404,6 @@ def _plan(selected: _Selection, samples: int, end: Boundary, at: int | None) -> 
     return signal_plan(tuple(rule.formula for rule in rules), samples, instants, end)
 
 
-def _selection(compiled: Compiled, names: Sequence[str], plain: bool) -> _Selection:
-    rules, horizon = _chosen(compiled, names), compiled.grid.horizon
-    needs = needs_of(compiled, [*rules, *compiled.assumptions] if plain else rules)
-    spans = (span_of(rule, horizon) for rule in rules)
-    reach = Reach(*map(max, zip(*spans, strict=True)))
-    return _Selection(compiled, rules, needs, tuple(rule.factor for rule in rules), reach)
-
-
 def _chosen(compiled: Compiled, names: Sequence[str]) -> tuple[CompiledRequirement, ...]:
     """Requirements called `names`; all if there are no names. Raises UsageError (U101) if there are none."""
     if not compiled.requirements:
@@ -436,14 +437,6 @@ def _least(ready: Prepared, end: Boundary, at: int | None) -> Array:
     factors = (rule.factor for rule in ready.rules)
     whole = TOLERANCE.overall(_rows(ready, end, at), factors, ops, ready.record.semantics)
     return ready.signals.like_given(whole) if at is None else ready.signals.at_one(whole)
-
-
-def _scope(ready: Prepared, tolerance: float) -> Bools:
-    """Return for each trace whether it counts: False if it certainly violates an assumption, (traces,)."""
-    scope = np.ones(ready.signals.batch, dtype=bool)
-    for rule in ready.compiled.assumptions:
-        scope &= ~_judge(rule, ready, range(1), "open", tolerance, ready.part(rule)).fails[0]
-    return scope
 
 
 def _starts(rule: CompiledRequirement, part: Part, ready: Prepared, at: At) -> range:

@@ -299,7 +299,8 @@ class CauseFinder:
 
     def blame(self, formula: typed.Formula, sample: int, wanted: bool = True) -> CauseNode:
         """Return the tree that explains why `formula` does not have the truth value `wanted` at `sample`."""
-        node = self._node(formula, sample, wanted)
+        margin = self._margin(formula, sample, wanted)
+        node = CauseNode(formula, not wanted, sample, margin if wanted else -margin)
         match formula:
             case typed.Predicate():
                 return self._predicate(node)
@@ -414,10 +415,6 @@ class CauseFinder:
 
     def _least(self, parts: Sequence[Goal]) -> Goal:
         return parts[int(np.argmin([self._margin(*part) for part in parts]))]
-
-    def _node(self, formula: typed.Formula, sample: int, wanted: bool) -> CauseNode:
-        margin = self._margin(formula, sample, wanted)
-        return CauseNode(formula, not wanted, sample, margin if wanted else -margin)
 
     def _predicate(self, node: CauseNode) -> CauseNode:
         reads = self._reads(self._lowered(node.formula, not node.holds).numbers(), node.sample)

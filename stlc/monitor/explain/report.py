@@ -400,20 +400,19 @@ class _Words:
         return None
 
 
-def _in_order(leaf: CauseNode) -> list[tuple[str, int]]:
-    """Reads of a predicate, in the order in which its text names the signals; those of definitions last."""
+def readings_of(leaf: CauseNode, subject: Prepared, samples: int) -> tuple[SignalValue, ...]:
+    """Values that a predicate reads in the first `samples` samples, in the order of its text.
+
+    Those that its definitions read come last.
+    """
     words = re.findall(r"\w+(?:\[\d+\])?", leaf.span.text)
     places = {word: place for place, word in reversed(list(enumerate(words)))}
-    return sorted(
+    reads = sorted(
         leaf.reads, key=lambda read: (places.get(read[0], len(words)), read[0], abs(read[1]), read[1])
     )
-
-
-def readings_of(leaf: CauseNode, subject: Prepared, samples: int) -> tuple[SignalValue, ...]:
-    """Values that a predicate reads in the first `samples` samples, in the order of its text."""
     found = []
     signature, env = subject.compiled.signature, subject.record.env
-    for name, later in _in_order(leaf):
+    for name, later in reads:
         sample = leaf.sample + later
         if name not in signature or not 0 <= sample < samples:
             continue

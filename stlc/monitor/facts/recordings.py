@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic
 from stlc.escape import visible
@@ -63,7 +62,12 @@ def unchanging(evidence: Evidence) -> Iterator[Fact]:
         stuck = ~still & (samples - last > max(STUCK * samples, FEW)) & (before > LIVELY)
         found = still if still.any() else stuck
         trace = int(np.argmax(found))
-        first, length = _longest_rest(moves[:, 0]) if traces == 1 else (0, 0)
+        first = length = 0
+        if traces == 1:  # the longest run of equal values
+            edges = np.concatenate([[-1], np.flatnonzero(moves), [len(moves)]])
+            rests = np.diff(edges) - 1
+            longest = int(np.argmax(rests))
+            first, length = int(edges[longest]) + 1, int(rests[longest])
         if found is still:
             told = "throughout"
         elif found.any():
@@ -77,14 +81,6 @@ def unchanging(evidence: Evidence) -> Iterator[Fact]:
         value = f"{float(values[first, trace]):g} {column.unit.text}".rstrip()
         many = f" in {int(found.sum()):,} of {traces:,} traces" if traces > 1 else ""
         yield _about("W715", f"`{visible(column.name)}` is {value} {told}{many}", evidence, column.name)
-
-
-def _longest_rest(moves: NDArray[np.bool_]) -> tuple[int, int]:
-    """First sample of the longest run of equal values, and the number of steps without a change."""
-    edges = np.concatenate([[-1], np.flatnonzero(moves), [len(moves)]])
-    gaps = np.diff(edges) - 1
-    longest = int(np.argmax(gaps))
-    return int(edges[longest]) + 1, int(gaps[longest])
 
 
 def odd_values(evidence: Evidence) -> Iterator[Fact]:
