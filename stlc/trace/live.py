@@ -470,7 +470,12 @@ class Gridded:
             bad = int(np.argmax(np.append(wrong, True)))
             self._came, self._last = self._came + bad, float(np.append(self._last, times)[bad])
             for signal, values in each.timed(times[:bad]).columns.items():
-                buffer, known = self._buffer(signal), ~np.isnan(values)
+                if signal not in self._buffers:
+                    base, kinds, between = signal.partition("[")[0], self.reading.kinds, self.reading.between
+                    held = (kinds.get(signal) or kinds.get(base) or "real") != "real"
+                    usual = Between("hold" if held else "linear")
+                    self._buffers[signal] = _Buffer(between.get(signal) or between.get(base) or usual)
+                buffer, known = self._buffers[signal], ~np.isnan(values)
                 buffer.times = np.append(buffer.times, times[:bad][known])
                 buffer.values = np.append(buffer.values, values[known])
             yield times[:bad]
@@ -479,14 +484,6 @@ class Gridded:
                     message = f"time in the {self.name} runs backwards: {before[bad]:g} s, {times[bad]:g} s"
                     raise TraceError.of("E602", message)
                 require_span(self.name, self.t0, float(times[bad]))
-
-    def _buffer(self, signal: str) -> _Buffer:
-        if signal not in self._buffers:
-            base, kinds, between = signal.partition("[")[0], self.reading.kinds, self.reading.between
-            held = (kinds.get(signal) or kinds.get(base) or "real") != "real"
-            usual = Between("hold" if held else "linear")
-            self._buffers[signal] = _Buffer(between.get(signal) or between.get(base) or usual)
-        return self._buffers[signal]
 
     def _begin(self, first: Floats, given: float | None) -> None:
         self.dt = given or snapped(usual_step(first[:FIRST]))

@@ -184,13 +184,17 @@ class _Body:
             self.kinds |= dict.fromkeys(self.wrong, True)
             return self._by_blocks(data, start)
         self.text = ""
-        return [self._joined(i) for i in self.kept] if any(map(len, next(iter(self.parts.values())))) else []
-
-    def _joined(self, i: int) -> Array:
-        parts, word = self.parts.pop(i), self.kinds.get(i)
-        if word or (word is None and any((part != "").any() for part in parts)):
-            return np.concatenate(parts)
-        return np.concatenate([p if p.dtype.kind == "f" else np.full(len(p), np.nan) for p in parts])
+        if not any(map(len, next(iter(self.parts.values())))):
+            return []
+        columns: list[Array] = []
+        for i in self.kept:
+            parts, word = self.parts.pop(i), self.kinds.get(i)
+            if word is None:
+                word = any((part != "").any() for part in parts)
+            if not word:
+                parts = [p if p.dtype.kind == "f" else np.full(len(p), np.nan) for p in parts]
+            columns.append(np.concatenate(parts))
+        return columns
 
     def _block(self, begin: int, end: int) -> int:
         block = self.text[begin:end]
@@ -198,10 +202,19 @@ class _Body:
             rows, end = self._rows(begin, end)
         else:
             rows = [line.split(None if self.mark == BLANKS else self.mark) for line in block.split("\n")]
-        aligned = {k: self._aligned(row) for k, row in enumerate(rows) if self._is_filled(row)}
-        if ragged := [k for k, row in aligned.items() if row is None]:
+        full: dict[int, list[str]] = {}  # rows with a cell for each column
+        ragged: list[int] = []
+        for k, row in enumerate(rows):
+            if not self._is_filled(row):
+                continue
+            if len(row) == self.width:
+                full[k] = row
+            elif self._is_filled(row[self.width :]) or any(self.layout.names[len(row) :]):
+                ragged.append(k)
+            else:
+                full[k] = (row + [""] * self.width)[: self.width]
+        if ragged:
             self.wrong.setdefault(_RAGGED, []).append((begin, ragged[0], len(ragged)))
-        full = {k: row for k, row in aligned.items() if row is not None}
         for i in self.kept:
             self._take(i, [row[i] for row in full.values()], begin, list(full))
         return end
@@ -219,13 +232,6 @@ class _Body:
 
     def _is_filled(self, cells: list[str]) -> bool:
         return bool("".join(cells).strip(" " if self.mark == "\t" else " \t"))
-
-    def _aligned(self, row: list[str]) -> list[str] | None:
-        """The row with a cell for each column; None if a column lacks its cell, or a cell its column."""
-        if len(row) == self.width:
-            return row
-        wrong = self._is_filled(row[self.width :]) or any(self.layout.names[len(row) :])
-        return None if wrong else (row + [""] * self.width)[: self.width]
 
     def _take(self, i: int, cells: list[str], begin: int, places: list[int]) -> None:
         """Append the cells of a block to the column `i`; `places` are the numbers of their rows in it."""

@@ -253,7 +253,11 @@ class _Hdf5:
         if "MATLAB_object_decode" in item.attrs or kind == "function_handle":
             return Node(kind=kind[:60])
         if isinstance(item, self.h5py.Group):
-            parts = {field: self._elements(item, field) for field in self._members(item)}
+            parts: dict[str, list[tuple[Any, Any]]] = {}
+            for field in self._members(item):
+                child, parts[field] = item[field], [(item, field)]
+                if self._refers(child) and "MATLAB_class" not in child.attrs:  # those of a structure array
+                    parts[field] = [(self.file, each) for each in self._values(child).ravel("F")]
             count = max(map(len, parts.values()), default=0)
             each = ({f: self._node(*p[i]) for f, p in parts.items() if i < len(p)} for i in range(count))
             return Node((count,), fields=each)
@@ -263,13 +267,6 @@ class _Hdf5:
         if not plain or item.is_virtual or item.external:
             return Node(kind=_OTHER)
         return Node(shape, partial(self._values, item, logical=kind == "logical"), text=kind == "char")
-
-    def _elements(self, group: Any, field: str) -> list[tuple[Any, Any]]:
-        """Values of a field: one in the group, or those of a structure array by references."""
-        child = group[field]
-        if self._refers(child) and "MATLAB_class" not in child.attrs:
-            return [(self.file, each) for each in self._values(child).ravel("F")]
-        return [(group, field)]
 
     def _refers(self, item: Any) -> bool:
         return isinstance(item, self.h5py.Dataset) and self.h5py.check_ref_dtype(item.dtype) is not None

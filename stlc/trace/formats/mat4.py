@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import islice
@@ -92,14 +93,9 @@ def modelica(path: Path, wanted: Wanted) -> Recording | None:
         values = data[k][:, abs(column) - 1].astype(np.float64) * (1 if column > 0 else -1)
         if k != main and (values == values[:1]).all():
             k, values = main, np.broadcast_to(values[:1], len(data[main]))
-        groups[k][name], found.units[name] = values, _unit(note)
+        groups[k][name], found.units[name] = values, ""
+        if (unit := _UNIT.search(note)) is not None:
+            with suppress(ValueError):
+                found.units[name] = Unit.parse(unit[1].replace(".", "*").strip()).text
     times = {k: data[k][:, 0].astype(np.float64) for k, arrays in groups.items() if arrays or k == main}
     return found.recording(path, (ClockGroup(groups[k], clock, "time") for k, clock in times.items()))
-
-
-def _unit(note: str) -> str:
-    found = _UNIT.search(note)
-    try:
-        return Unit.parse(found[1].replace(".", "*").strip()).text if found else ""
-    except ValueError:
-        return ""

@@ -85,7 +85,13 @@ class _Measurement:
     def group(self, g: int, group: Any) -> ClockGroup:
         """Read the channels of group number `g` that are wanted."""
         master = self.file.masters_db.get(g)
-        why = self._no_time(group, master)
+        why = ""
+        if master is None:
+            why = "has no times: its group has no master channel"
+        elif not self.old and group.channels[master].sync_type not in _TIMES:
+            why = f"is recorded over `{group.channels[master].name}`, which is not a time"
+        elif self._has_formula(group.channels[master]):
+            why = "has no times: a formula defines them"
         kept, names = replace(self.found, kept={}), dict[str, int]()
         for c in range(len(group.channels)):
             for name in self._names(g, c, group) if c != master else ():
@@ -122,14 +128,6 @@ class _Measurement:
         elif not found:
             self.found.note(name)
         return found
-
-    def _no_time(self, group: Any, master: int | None) -> str:
-        """Return why a group has no times, or ""."""
-        if master is None:
-            return "has no times: its group has no master channel"
-        if not self.old and group.channels[master].sync_type not in _TIMES:
-            return f"is recorded over `{group.channels[master].name}`, which is not a time"
-        return "has no times: a formula defines them" if self._has_formula(group.channels[master]) else ""
 
     def _has_formula(self, channel: Any) -> bool:
         """True if a formula is in the conversion of a channel, or in one that it refers to."""

@@ -55,15 +55,15 @@ class Path:
         self.element = "".join(text.rpartition(self.keys[-1])[:2]) if self.keys else ""
         self.moved = ""
         self._addressed: dict[int, str] = {}
-        self._fields = [[*self._meant(at)] for at in range(len(self.steps))]
-
-    def _meant(self, at: int) -> Iterator[tuple[str, int]]:
-        """The fields that a step may mean, with the number of the step after it: keys may hold dots."""
-        if self.steps[at][0] == "[":
-            yield self.steps[at][1:-1], at + 1
-        else:
-            for after in range(at + 1, len(self.steps) + 1):
-                yield "".join(self.steps[at:after]).removeprefix("."), after
+        # fields that each step may mean, with the number of the step after it: keys may hold dots
+        self._fields: list[list[tuple[str, int]]] = []
+        for at, step in enumerate(self.steps):
+            if step[0] == "[":
+                fields = [(step[1:-1], at + 1)]
+            else:
+                ends = range(at + 1, len(self.steps) + 1)
+                fields = [("".join(self.steps[at:end]).removeprefix("."), end) for end in ends]
+            self._fields.append(fields)
 
     def find(self, tree: object) -> list[object]:
         """Return the part of a message, or [] if the message lacks it.
