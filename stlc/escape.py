@@ -74,19 +74,19 @@ def shell(words: Iterable[str]) -> str:
 
     Control characters are written as escape sequences.
     """
-    return " ".join(_word(word) for word in words)
+    special = {"\\": r"\\", "'": r"\'"}
+    quoted: list[str] = []
+    for word in words:
+        if _INVISIBLE.search(word):
+            quoted.append("$'" + "".join(special.get(char, _ansi(char)) for char in word) + "'")
+        else:
+            quoted.append(shlex.quote(word))
+    return " ".join(quoted)
 
 
 def operand(path: str) -> str:
     """Return a path for use as a command-line argument; `./` is put before a leading dash."""
     return f"./{path}" if path.startswith("-") else path
-
-
-def _word(text: str) -> str:
-    if not _INVISIBLE.search(text):
-        return shlex.quote(text)
-    special = {"\\": r"\\", "'": r"\'"}
-    return "$'" + "".join(special.get(char, _ansi(char)) for char in text) + "'"
 
 
 def _ansi(char: str) -> str:

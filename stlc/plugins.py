@@ -71,8 +71,13 @@ def plugins(group: str, attribute: str = "") -> dict[str, tuple[Plugin, ...]]:
     `attribute` is the name of the object in files; "": that of the plugin. Several packages may bring plugins
     of one name.
     """
+    files: list[Path] = []  # of one name, the last one wins
+    for text in filter(None, os.environ.get(variable(group), "").split(os.pathsep)):
+        path = Path(text)
+        files += sorted(path.glob("[!_]*.py")) if path.is_dir() else [path]
+    named = (Plugin(group, each.stem, each, attribute or each.stem, f"the file `{each}`") for each in files)
     found: dict[str, tuple[Plugin, ...]] = {}
-    for plugin in (*installed(), *_named(group, attribute)):
+    for plugin in (*installed(), *named):
         if plugin.group == group:
             before = () if isinstance(plugin.place, Path) else found.get(plugin.name, ())
             found[plugin.name] = (*before, plugin)
@@ -100,14 +105,6 @@ def name_path(group: str, path: Path) -> str:
     before = [each for each in os.environ.get(variable(group), "").split(os.pathsep) if each]
     os.environ[variable(group)] = os.pathsep.join(dict.fromkeys((*before, str(path.absolute()))))
     return path.stem
-
-
-def _named(group: str, attribute: str) -> Iterator[Plugin]:
-    """Plugins of the files that the environment variable of the group names; the last one wins."""
-    for text in filter(None, os.environ.get(variable(group), "").split(os.pathsep)):
-        path = Path(text)
-        for each in sorted(path.glob("[!_]*.py")) if path.is_dir() else (path,):
-            yield Plugin(group, each.stem, each, attribute or each.stem, f"the file `{each}`")
 
 
 @cache
