@@ -10,6 +10,7 @@ import pytest
 
 from stlc.diagnostics import SpecError
 from stlc.monitor.verdict import Monitor
+from tests.helpers.open_starts import open_starts
 
 HEAD = """\
 signal x, y
@@ -102,5 +103,5 @@ require r: alw[0, T - 3000 ms) (not x <= -1.24 & if z > 0.47 then b else (c) & (
     stream = monitor.online()
     for k in range(14):
         stream.push({name: values[k] for name, values in signals.items()})
-        for _, low, high in stream.open_starts("r"):
+        for _, low, high in open_starts(stream, "r"):
             assert low - 1e-9 <= -0.329 <= high + 1e-9

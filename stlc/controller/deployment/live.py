@@ -9,39 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.semantics.tolerance import TOLERANCE, StatusInScope
 from stlc.controller.guard.candidates import SOURCES
 from stlc.jsontext import Count, Num
-from stlc.monitor.online.online import Online
+from stlc.monitor.online.online import Margin, Online
 
 if TYPE_CHECKING:
     from stlc.controller.deployment.batched import Setting
     from stlc.controller.deployment.simulator import SimulationStep
     from stlc.controller.problem.task import Task
-
-
-@dataclass(frozen=True, slots=True)
-class Margins:
-    """Margin of a requirement (`stlc.monitor.online.online.Margin`) for each agent, (agents,)."""
-
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
-    violated: NDArray[np.int64]
-    open: NDArray[np.int64]
-
-    def status(self, agent: int) -> StatusInScope:
-        """Violated if the agent violated it at any start, satisfied if it did at none and none is open."""
-        return TOLERANCE.status(bool(self.violated[agent]), not self.open[agent])
-
-
-@dataclass(frozen=True, slots=True)
-class LiveMargin:
-    """Bounds on the robustness of a requirement until now, and the number of violated instants."""
-
-    status: StatusInScope
-    low: Num
-    high: Num
-    violated: Count
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +41,7 @@ class RobustnessLine:
     plan_rho: Num | None
     policy_rho: Num | None
     plan_safe: bool | None
-    margins: Mapping[str, LiveMargin]
+    margins: Mapping[str, Margin]
 
 
 class LiveMonitor:
@@ -85,7 +60,7 @@ class LiveMonitor:
         self.counts: NDArray[np.int64] = np.zeros(len(SOURCES), dtype=np.int64)
         self._monitors: list[Online] = []
         self._states: list[NDArray[np.float64]] = []
-        self._found: dict[str, Margins] = {}
+        self._found: dict[str, list[Margin]] = {}
 
     def push(self, moment: SimulationStep) -> None:
         """Append the next step of the deployment."""
@@ -95,8 +70,8 @@ class LiveMonitor:
             self.counts += np.bincount(moment.decision.source.numpy(force=True), minlength=len(SOURCES))
 
     @property
-    def margins(self) -> dict[str, Margins]:
-        """Bounds on the robustness of every requirement, given the samples until now; there is one."""
+    def margins(self) -> dict[str, list[Margin]]:
+        """Name of a requirement -> its margin for each agent, given the samples until now; there is one."""
         if self._states:
             states = np.stack(self._states, axis=1, dtype=np.float64)  # (agents, samples, states)
             self._states.clear()
@@ -106,8 +81,7 @@ class LiveMonitor:
             for online, rows in zip(self._monitors, states, strict=True):
                 online.push_block(rows[:, columns])
             for name in self._monitors[0].requirements:
-                each = zip(*(online.margin(name) for online in self._monitors), strict=True)
-                self._found[name] = Margins(*map(np.array, each))
+                self._found[name] = [online.margin(name) for online in self._monitors]
         return self._found
 
     @property
@@ -141,13 +115,5 @@ class LiveMonitor:
                 plan_rho=None if decision is None else float(decision.rho[row]),
                 policy_rho=None if decision is None else float(decision.policy_rho[row]),
                 plan_safe=None if decision is None else bool(decision.safe[row]),
-                margins={
-                    name: LiveMargin(
-                        found.status(row),
-                        float(found.low[row]),
-                        float(found.high[row]),
-                        int(found.violated[row]),
-                    )
-                    for name, found in margins.items()
-                },
+                margins={name: found[row] for name, found in margins.items()},
             )

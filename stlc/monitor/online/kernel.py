@@ -20,9 +20,6 @@ from stlc.monitor.online.history import Floats
 from stlc.monitor.online.tally import Asked, JudgedInstants, RequirementSummary
 from stlc.monitor.signals import Gap
 
-_OPEN, _GROWING, _ENDED, _CLIPPED = 1, 2, 3, 4
-"""Continuation after the samples: others, where the end may cut windows to it, or all windows; or nothing."""
-
 _HEAD = "#define REAL double\n#define API\n"
 
 _MOST = 1 << 32
@@ -41,21 +38,28 @@ class _Tables(ctypes.Structure):
     )
 
 
+_TYPES = {"q": ctypes.c_int64, "p": ctypes.c_void_p, "i": ctypes.c_int32, "d": ctypes.c_double, "-": None}
+
+_FUNCTIONS = {
+    "stlc_size": "qp",
+    "stlc_place": "-pp",
+    "stlc_init": "-piqiid",
+    "stlc_block": "qppqip",
+    "stlc_look": "-piiiqqp",
+    "stlc_news": "qppq",
+    "stlc_tally": "-pipp",
+    "stlc_gap": "-pip",
+}
+"""Function of `streams.c` -> types of its result and of its arguments."""
+
+
 @cache
 def _transducers() -> ctypes.CDLL | None:
     """Library of the transducers of all monitors."""
     library = native.load(_HEAD + "".join(runtime()))
-    if library is not None:
-        pointer, integer, flag = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32
-        library.stlc_size.restype = library.stlc_block.restype = library.stlc_news.restype = integer
-        library.stlc_size.argtypes = [pointer]
-        library.stlc_place.argtypes = [pointer, pointer]
-        library.stlc_init.argtypes = [pointer, flag, integer, flag, flag, ctypes.c_double]
-        library.stlc_block.argtypes = [pointer, pointer, integer, flag, pointer]
-        library.stlc_look.argtypes = [pointer, flag, flag, flag, integer, integer, pointer]
-        library.stlc_news.argtypes = [pointer, pointer, integer]
-        library.stlc_tally.argtypes = [pointer, flag, pointer, pointer]
-        library.stlc_gap.argtypes = [pointer, flag, pointer]
+    for name, types in _FUNCTIONS.items() if library else ():
+        function = getattr(library, name)
+        function.restype, *function.argtypes = map(_TYPES.get, types)
     return library
 
 
@@ -89,7 +93,6 @@ class StreamKernel:
         self._known = ctypes.c_int64.from_address(self.at + 8)  # `s.known`, after a pointer
         library.stlc_place(self.at, self.program)
         self._row = (ctypes.c_double * program.sizes["signals"])()
-        self._news = (ctypes.c_int64 * 3)()
         self._step = library.stlc_step
         self._arguments = (ctypes.c_void_p(self.at), ctypes.cast(self._row, ctypes.c_void_p))
         for rule, each in enumerate(asked):
@@ -135,12 +138,10 @@ class StreamKernel:
 
     def news(self) -> list[tuple[int, int, int]]:
         """Starts that the latest sample decided: number of the requirement, start, truth (1: no, 2: yes)."""
-        found, room = self._news, len(self._news) // 3
-        count = self.library.stlc_news(self.at, found, room)
-        if count > room:
-            self._news = (ctypes.c_int64 * (6 * count))()
-            return self.news()
-        return sorted([(found[i], found[i + 1], found[i + 2]) for i in range(0, 3 * count, 3)])
+        count = self.library.stlc_news(self.at, None, 0)
+        found = (ctypes.c_int64 * (3 * count))()
+        self.library.stlc_news(self.at, found, count)
+        return sorted(zip(found[::3], found[1::3], found[2::3], strict=True))
 
     def gap(self, signal: int) -> Gap:
         """Samples at which a signal is unknown."""
@@ -176,34 +177,38 @@ class Streamed:
         """Bounds on the robustness at the start that was counted last."""
         return tuple(self._counted()[1][2:4])  # type: ignore[return-value]
 
-    def live(self, starts: range) -> JudgedInstants:
-        """Bounds and verdicts at starts that are not counted, while the trace continues."""
-        return self.asked.judged(self._look(starts, _GROWING if self.asked.ending == "truncate" else _OPEN))
+    def judged(self, starts: range, *, ended: bool = False) -> JudgedInstants:
+        """Bounds and verdicts at starts that are not counted, over all continuations of the trace.
 
-    def ended(self, starts: range) -> JudgedInstants:
-        """Bounds and verdicts at starts that are not counted, once the trace has ended."""
+        `ended`: the trace ends with the last sample.
+        """
         asked, cut = self.asked, self.asked.ending == "truncate"
-        out = self._look(starts, _CLIPPED if cut else _ENDED)
-        if cut and (outside := beyond(asked.rule, starts, self.kernel.samples, asked.horizon)).any():
-            other = self._look(starts, _GROWING)[outside]
+        out = self._look(starts, cut=cut, ended=ended)
+        if (
+            cut
+            and ended
+            and (outside := beyond(asked.rule, starts, self.kernel.samples, asked.horizon)).any()
+        ):
+            other = self._look(starts, cut=True, ended=False)[outside]
             out[outside, ::2] = np.minimum(out[outside, ::2], other[:, ::2])
             out[outside, 1::2] = np.maximum(out[outside, 1::2], other[:, 1::2])
         return asked.judged(out)
 
-    def _look(self, starts: range, after: int) -> Floats:
-        """Bounds at consecutive instants that are not counted, over all that may follow, (instants, 4)."""
+    def _look(self, starts: range, *, cut: bool, ended: bool) -> Floats:
+        """Bounds at consecutive instants that are not counted, (instants, 4)."""
         out, kernel = np.zeros((len(starts), 4)), self.kernel
         if starts:
             copy = kernel.state.copy()
-            place, where, clip = copy.ctypes.data, out.ctypes.data, after == _CLIPPED
+            place, where, after = copy.ctypes.data, out.ctypes.data, 1 + cut + 2 * ended  # OPEN to CLIPPED
             kernel.library.stlc_place(place, kernel.program)
-            kernel.library.stlc_look(place, self.number, after, clip, starts.start, len(starts), where)
+            found = (self.number, after, cut and ended, starts.start, len(starts), where)
+            kernel.library.stlc_look(place, *found)
         return out
 
 
 def streamed_rule(asked: Asked, signals: Sequence[str]) -> Rule | None:
     """Return the requirement of a kernel; None if it has no transducers."""
-    values, deciding = (_in_windows(each, asked) for each in (asked.rule, asked.deciding))
+    values, deciding = (_in_windows(each, asked) for each in (asked.rules[0], asked.rules[-1]))
     if values is None or deciding is None or (asked.everywhere and values.endless):
         return None
     rule = Rule(values, deciding, asked.lag)

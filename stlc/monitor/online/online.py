@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from stlc.compile.pipeline import Compiled, CompiledRequirement
-from stlc.compile.semantics.tolerance import TOLERANCE, Status
+from stlc.compile.semantics.tolerance import TOLERANCE, Status, StatusInScope
 from stlc.diagnostics import TraceError, usage
+from stlc.jsontext import Count, Num
 from stlc.monitor.explain.report import Cause
 from stlc.monitor.instants import At, check_length, starts_of
 from stlc.monitor.judgement import require_known
@@ -73,21 +74,22 @@ class How:
     reasons: bool = False
 
 
-class Margin(NamedTuple):
-    """Robustness margin of a requirement at the latest sample.
+@dataclass(frozen=True, slots=True)
+class Margin:
+    """Robustness margin of a requirement at the latest sample, and its verdict up to there.
 
     Attributes:
+        status: verdict over all starts until now.
         low: least robustness over all continuations; where the requirement is evaluated at every sample, the
             minimum over the windows that contain the latest one.
         high: greatest robustness over all continuations, or its minimum over the same windows.
-        fails: number of starts at which the requirement is certainly violated.
-        open: number of starts at which it is undecided.
+        violated: number of starts until now at which the requirement is certainly violated.
     """
 
-    low: float
-    high: float
-    fails: int
-    open: int
+    status: StatusInScope
+    low: Num
+    high: Num
+    violated: Count
 
 
 Watched: TypeAlias = Streamed | Recomputed
@@ -140,7 +142,8 @@ class Online:
             raise usage(message, "judge it once, without `--at all`")
         ending: Ends = "truncate" if self.how.end == "truncate" else "open"
         deciding = decisive(rule, self.how.tolerance, self.compiled.signature)
-        return Asked(rule, deciding, begin, everywhere, horizon, ending, self.how.tolerance)
+        rules = (rule,) if deciding is rule else (rule, deciding)
+        return Asked(rules, begin, everywhere, horizon, ending, self.how.tolerance)
 
     def _watch(self, asked: Sequence[Asked]) -> tuple[StreamKernel | None, list[Watched]]:
         """Kernel of all requirements that have transducers, and what watches each requirement."""
@@ -267,16 +270,6 @@ class Online:
         """Number of samples received."""
         return self._history.samples if self._kernel is None else self._kernel.samples
 
-    def open_starts(self, name: str) -> list[tuple[int, float, float]]:
-        """Return the bounds on the robustness of the requirement `name` that are not final yet.
-
-        There is one triple (sample, least robustness, greatest robustness) for each such sample.
-        """
-        watched = self._find(name)
-        starts = watched.asked.starts(watched.tally.next, self.samples)
-        judged = watched.live(starts)
-        return list(zip(starts, judged.low.tolist(), judged.high.tolist(), strict=True))
-
     def bounds(self, name: str, start: int) -> tuple[float, float]:
         """Least and greatest robustness of the requirement `name` at a start, over all continuations.
 
@@ -291,19 +284,19 @@ class Online:
             return watched.counted
         if start not in watched.asked.starts(tally.next, self.samples):
             raise usage(f"`{name}` is not open at sample {start}")
-        judged = watched.live(range(start, start + 1))
+        judged = watched.judged(range(start, start + 1))
         return float(judged.low[0]), float(judged.high[0])
 
     def margin(self, name: str) -> Margin:
         """Robustness margin of the requirement `name` at the latest sample, of which there is one."""
         watched = self._find(name)
         tally = watched.tally
-        low, high, holds, fails = watched.live(watched.asked.starts(tally.next, self.samples))
-        ends = np.array((low, high))
+        judged = watched.judged(watched.asked.starts(tally.next, self.samples))
+        ends, until = np.array((judged.low, judged.high)), tally.with_more(judged)
         if tally.instants:
             ends = np.c_[ends, watched.counted]
-        least, most = ends.min(1).tolist()
-        return Margin(least, most, tally.fails + int(fails.sum()), len(low) - int((holds | fails).sum()))
+        low, high = ends.min(1).tolist()
+        return Margin(until.status, low, high, until.fails)
 
     def standing(self, name: str) -> RequirementSummary:
         """Summary of the requirement `name` over all samples at which it has been evaluated up to now.
@@ -315,7 +308,7 @@ class Online:
     def _standing(self, watched: Watched) -> RequirementSummary:
         tally = watched.tally
         starts = watched.asked.starts(tally.next, self.samples)
-        return tally.with_more(watched.live(starts))
+        return tally.with_more(watched.judged(starts))
 
     @property
     def in_scope(self) -> bool | None:
@@ -350,7 +343,7 @@ class Online:
         """Summary of a requirement if the trace ends now."""
         starts, tally = self._starts(watched), watched.tally
         rest = range(min(tally.next, starts.stop), starts.stop)
-        return tally.with_more(watched.ended(rest))
+        return tally.with_more(watched.judged(rest, ended=True))
 
     def cause(self, name: str) -> Cause | None:
         """Return the cause of the worst violation of a requirement up to now.

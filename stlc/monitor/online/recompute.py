@@ -8,7 +8,7 @@ whose end moves.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeAlias, final
@@ -45,19 +45,19 @@ Columns: TypeAlias = Mapping[str, Floats]
 @final
 @dataclass(frozen=True)
 class GrowingBounds:
-    """Bounds on a requirement at instants of a growing trace, from samples that include all that it reads.
+    """Bounds on requirements at instants of a growing trace, from samples that include all that they read.
 
     Attributes:
-        rule: the requirement.
+        rules: the requirements, which read the same samples.
         horizon: length of a planning window in steps; None if unknown.
         ending: whether the end of the trace cuts windows.
     """
 
-    rule: CompiledRequirement
+    rules: Sequence[CompiledRequirement]
     horizon: int | None
     ending: Ends
 
-    _span = cached_property(lambda self: span_of(self.rule, self.horizon))  # asked after each sample
+    _span = cached_property(lambda self: span_of(self.rules[0], self.horizon))  # asked after each sample
 
     def settled(self, samples: int) -> int:
         """The first instant at which a sample after `samples` of them may change the value."""
@@ -67,26 +67,27 @@ class GrowingBounds:
         """The first sample that instants from `start` on read."""
         return 0 if self._span.future == FAR else max(start - self._span.past, 0)
 
-    def live(self, signals: Columns, starts: range) -> tuple[Floats, Floats]:
-        """Least and greatest robustness over all continuations, (instants, traces) each."""
-        window, cut = window_of(self.rule, self.horizon), self.ending == "truncate"
-        formula, parts = self.rule.formula, []
-        record = Record.of(with_seen(signals))
-        middle = min(max(self.settled(record.samples), starts.start), starts.stop) if cut else starts.start
-        if known := range(starts.start, middle):
-            parts.append(cut_bounds(self.rule, record, known, self.horizon, "truncate"))
-        if rest := range(middle, starts.stop):
-            lower = upper = formula
-            if window is None or cut:
-                lower, upper = (prefix_bound(formula, end, cut=cut) for end in ("lower", "upper"))
-            parts.append(growing_bounds(lower, upper, record, rest, window))
-        low, high = (np.concatenate(ends) for ends in zip(*parts, strict=True))
-        return low, high
+    def at(self, signals: Columns, starts: range, *, ended: bool = False) -> Floats:
+        """Least and greatest robustness of each requirement in turn, (instants, 2 * requirements).
 
-    def ended(self, signals: Columns, starts: range) -> tuple[Floats, Floats]:
-        """Bounds if the trace ends with the last sample, (instants, traces) each."""
-        low, high = rule_bounds(self.rule, Record.of(signals), starts, self.horizon, self.ending)
-        return np.asarray(low), np.asarray(high)
+        The bounds are over all continuations; `ended`: the trace ends with the last sample.
+        """
+        record, cut = Record.of(signals if ended else with_seen(signals)), self.ending == "truncate"
+        middle = min(max(self.settled(record.samples), starts.start), starts.stop) if cut else starts.start
+        known, rest = range(starts.start, middle), range(middle, starts.stop)
+        found: list[Floats] = []
+        for rule in self.rules:
+            parts, window, lower, upper = [], window_of(rule, self.horizon), rule.formula, rule.formula
+            if ended:
+                parts.append(rule_bounds(rule, record, starts, self.horizon, self.ending))
+            elif known:
+                parts.append(cut_bounds(rule, record, known, self.horizon, "truncate"))
+            if rest and not ended:
+                if window is None or cut:
+                    lower, upper = (prefix_bound(rule.formula, end, cut=cut) for end in ("lower", "upper"))
+                parts.append(growing_bounds(lower, upper, record, rest, window))
+            found += (np.concatenate(ends) for ends in zip(*parts, strict=True))
+        return np.concatenate(found, axis=1)
 
 
 @final
@@ -95,14 +96,14 @@ class Extremum:
     """Running extremum of `always` or `eventually` to the end of the trace, over instants with final values.
 
     Attributes:
-        bodies: bounds on the operand, of the robustness and of that which decides.
+        body: bounds on the operand.
         lo: first instant of the window, after that of the operator.
         choose: minimum or maximum.
         next: the first instant that is not taken in.
-        known: bounds over the instants that are, as of `Asked.judged`.
+        known: bounds over the instants that are, (1, 2 * requirements).
     """
 
-    bodies: Sequence[GrowingBounds]
+    body: GrowingBounds
     lo: int
     choose: np.ufunc
     next: int
@@ -117,27 +118,25 @@ class Extremum:
             return None
         if node.op not in ("always", "eventually"):
             return None
-        bodies = []
-        for each in (rule, asked.deciding):
+        inner = []
+        for each in asked.rules:
             (body,) = each.formula.operands
-            inner = replace(each, formula=body, lowered=body, reach=body.reach.future)
-            bodies.append(GrowingBounds(inner, asked.horizon, "open"))
+            inner.append(replace(each, formula=body, lowered=body, reach=body.reach.future))
         choose, lo = np.minimum if node.op == "always" else np.maximum, node.window.lo
-        return Extremum(bodies, lo, choose, asked.begin + lo, np.full((1, 4), neutral(PICKS[node.op])))
+        known = np.full((1, 2 * len(inner)), neutral(PICKS[node.op]))
+        return Extremum(GrowingBounds(inner, asked.horizon, "open"), lo, choose, asked.begin + lo, known)
 
     @property
     def needs(self) -> int:
         """The first sample that later instants read."""
-        return min(max(self.next - self.lo, 0), *(body.needs(self.next) for body in self.bodies))
+        return min(max(self.next - self.lo, 0), self.body.needs(self.next))
 
     def take(self, history: ColumnHistory) -> None:
         """Take in instants with final values, some at a time; the last one stays."""
-        stop = min(body.settled(history.samples) for body in self.bodies) - 1
+        stop = self.body.settled(history.samples) - 1
         if stop < self.next + _FINAL:
             return
-        first, signals = history.first, history.columns()
-        there = range(self.next - first, stop - first)
-        found = np.concatenate([end for body in self.bodies for end in body.live(signals, there)], axis=1)
+        found = self.body.at(history.columns(), range(self.next - history.first, stop - history.first))
         self.known = self.choose(self.choose.reduce(found, axis=0, keepdims=True), self.known)
         self.next = stop
 
@@ -168,7 +167,7 @@ class Recomputed:
         asked = self.asked
         _require_bounded(asked)
         self.tally = RequirementSummary(low_at=asked.begin, high_at=asked.begin, first=asked.begin)
-        self._values = GrowingBounds(asked.rule, asked.horizon, asked.ending)
+        self._values = GrowingBounds(asked.rules, asked.horizon, asked.ending)
         self._final = Extremum.of(asked)
 
     @property
@@ -184,7 +183,7 @@ class Recomputed:
         if self._over or (stored > _NARROW and samples < self._looked + stored // 8):
             return
         self._looked, starts = samples, self.asked.starts(self.tally.next, samples)
-        judged = self.live(starts)
+        judged = self.judged(starts)
         known = judged.holds | judged.fails
         new = known.copy()
         new[: len(self._decided)] &= ~self._decided
@@ -207,28 +206,13 @@ class Recomputed:
         starts = [*self.news] if self._over else [self.tally.next, *self.news]
         return min(map(self._values.needs, starts), default=self._history.samples)
 
-    def live(self, starts: range) -> JudgedInstants:
-        """Return what `Streamed.live` does."""
-        return self._judged(starts, GrowingBounds.live)
-
-    def ended(self, starts: range) -> JudgedInstants:
-        """Return what `Streamed.ended` does."""
-        return self._judged(starts, GrowingBounds.ended)
-
-    def _judged(
-        self, starts: range, bounds: Callable[[GrowingBounds, Columns, range], tuple[Floats, Floats]]
-    ) -> JudgedInstants:
+    def judged(self, starts: range, *, ended: bool = False) -> JudgedInstants:
+        """Return what `Streamed.judged` does."""
+        asked, history, final = self.asked, self._history, self._final
         if not starts:
-            return self.asked.judged(np.zeros((0, 4)))
-        first, signals, asked = self._history.first, self._history.columns(), self.asked
-        final, there = self._final, range(starts.start - first, starts.stop - first)
-        if final is not None:
-            begin = final.next - final.lo - first
-            there = range(begin, begin + 1)
-        values = truths = bounds(self._values, signals, there)
-        if asked.deciding is not asked.rule:
-            truths = bounds(GrowingBounds(asked.deciding, asked.horizon, asked.ending), signals, there)
-        found = np.concatenate([*values, *truths], axis=1)
+            return asked.judged(np.zeros((0, 2)))
+        begin = (starts.start if final is None else final.next - final.lo) - history.first
+        found = self._values.at(history.columns(), range(begin, begin + len(starts)), ended=ended)
         return asked.judged(found if final is None else final.choose(found, final.known))
 
 

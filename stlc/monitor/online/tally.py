@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, final
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.pipeline import CompiledRequirement
-from stlc.compile.semantics.tolerance import TOLERANCE, Status
+from stlc.compile.semantics.tolerance import TOLERANCE, StatusInScope
 from stlc.monitor.online.history import Floats
 from stlc.monitor.values import Ends
 
@@ -23,8 +24,7 @@ class Asked:
     """Requirement to watch.
 
     Attributes:
-        rule: the requirement.
-        deciding: the requirement whose robustness decides the verdict; mostly `rule`.
+        rules: the requirement, and that whose robustness decides the verdict if it is another.
         begin: the first start.
         everywhere: whether every later sample is a start, too.
         horizon: length of a planning window in steps; None if unknown.
@@ -32,13 +32,17 @@ class Asked:
         tolerance: a requirement is satisfied if its robustness is at least minus this value.
     """
 
-    rule: CompiledRequirement
-    deciding: CompiledRequirement
+    rules: Sequence[CompiledRequirement]
     begin: int
     everywhere: bool
     horizon: int | None
     ending: Ends = "open"
     tolerance: float = TOLERANCE
+
+    @property
+    def rule(self) -> CompiledRequirement:
+        """The requirement."""
+        return self.rules[0]
 
     @property
     def lag(self) -> int:
@@ -52,8 +56,8 @@ class Asked:
         return range(first, samples if self.everywhere else min(self.begin + 1, samples))
 
     def judged(self, bounds: Floats) -> JudgedInstants:
-        """Verdicts from bounds on the robustness and on that which decides, (instants, 4)."""
-        low, high, least, most = bounds.T
+        """Verdicts from bounds on the robustness and on that which decides, (instants, 2 or 4)."""
+        (low, high), (least, most) = bounds.T[:2], bounds.T[-2:]
         return JudgedInstants(
             low, high, TOLERANCE.satisfied(least, self.tolerance), TOLERANCE.violated(most, self.tolerance)
         )
@@ -116,7 +120,7 @@ class RequirementSummary:
         return self.first + self.instants
 
     @property
-    def status(self) -> Status:
+    def status(self) -> StatusInScope:
         """Violated if violated at any counted instant, satisfied if satisfied at all, else inconclusive."""
         return TOLERANCE.status(self.fails > 0, 0 < self.instants == self.holds)
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.instants import rule_bounds
+from stlc.monitor.online.online import Margin
 from stlc.monitor.online.recompute import GrowingBounds
 from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
@@ -51,8 +52,7 @@ def test_margins_are_those_of_the_trace_so_far(formulas: list[str], seed: int, s
             found = [online.margin(rule.name) for online in alone]
             for margin, online in zip(found, alone, strict=True):
                 known = online.standing(rule.name)
-                assert margin.fails == known.fails
-                assert margin.open == known.instants - known.fails - known.holds
+                assert (margin.violated, margin.status) == (known.fails, known.status)
             low, high = anew(judge, rule, data[: k + 1])
             assert [margin.low for margin in found] == low
             assert [margin.high for margin in found] == high
@@ -67,8 +67,8 @@ def anew(judge: Monitor, rule, data):  # type: ignore[no-untyped-def]
     ends = []
     for trace in range(TRACES):
         columns = {"x": data[:, 0, trace, None], "y": data[:, 1, trace, None]}
-        ends.append(GrowingBounds(rule, horizon, "open").live(columns, starts))
-    return [low.min() for low, _ in ends], [high.min() for _, high in ends]
+        ends.append(GrowingBounds([rule], horizon, "open").at(columns, starts).min(axis=0))
+    return [low for low, _ in ends], [high for _, high in ends]
 
 
 @pytest.mark.parametrize("often", [1, 3, 7, 100])
@@ -88,10 +88,10 @@ def test_looking_seldom_counts_the_same(often: int) -> None:
         assert [margin.low for margin in found] == low
         assert [margin.high for margin in found] == high
         _, every = rule_bounds(rule, Record({"x": data[:, 0], "y": data[:, 1]}, NUMPY), range(150), 4, "open")
-        assert [margin.fails for margin in found] == (every < -TOLERANCE).sum(0).tolist()
+        assert [margin.violated for margin in found] == (every < -TOLERANCE).sum(0).tolist()
 
 
 def test_a_requirement_of_nothing_has_a_margin() -> None:
     online = Monitor("signal x\nrequire a: true", dt=1, horizon=4).online()
     online.push_block(np.zeros((1, 0)))
-    assert online.margin("a") == (np.inf, np.inf, 0, 0)
+    assert online.margin("a") == Margin("satisfied", np.inf, np.inf, 0)

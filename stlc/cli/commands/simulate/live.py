@@ -6,7 +6,7 @@ Without a terminal, the view is ten lines of text.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,9 +20,8 @@ from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import SOURCES
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from stlc.controller.deployment.live import LiveMonitor, Margins
+    from stlc.controller.deployment.live import LiveMonitor
+    from stlc.monitor.online.online import Margin
     from stlc.signature import Column
 
 REDRAWN = 0.5
@@ -98,15 +97,19 @@ class LiveView:
         It shows the step, how often the guard intervened, the least robustness, and the number of agents that
         violate a requirement.
         """
-        worst = min(self.monitor.margins.items(), key=lambda each: float(each[1].high.min()))
-        name, agent = worst[0], int(worst[1].high.argmin())
-        violated = np.any([margin.violated > 0 for margin in self.monitor.margins.values()], axis=0)
+        margins = self.monitor.margins
+        name = min(margins, key=lambda name: _least(margins[name]).high)
+        least = _least(margins[name])
+        row = margins[name].index(least)
+        violated = [
+            any(margin.violated for margin in agents) for agents in zip(*margins.values(), strict=True)
+        ]
         counts = self.monitor.counts
         parts = (
             self._counter(),
             f"guard acted in {int(counts[1:].sum()):,} of {int(counts.sum()):,}",
-            f"least margin {name} {_signed(float(worst[1].high[agent]))} ({self._agent(agent)})",
-            f"violated by {int(violated.sum())} of {len(violated)}",
+            f"least margin {name} {_signed(least.high)} ({self._agent(row)})",
+            f"violated by {sum(violated)} of {len(violated)}",
         )
         return "  " + "   ".join(parts)
 
@@ -143,14 +146,14 @@ class LiveView:
         """
         margins = self.monitor.margins
         units = {rule.name: rule.typed.formula.margin_unit for rule in self.monitor.task.rules}
-        texts = {name: self._texts(margin, units.get(name, "")) for name, margin in margins.items()}
+        texts = {name: self._texts(found, units.get(name, "")) for name, found in margins.items()}
         wide = [max(len(parts[k]) for parts in texts.values()) for k in range(3)]
         label = max(map(len, margins))
         room = width - label - sum(wide) - len("      │      ")
         half = min(max(room // 2, NARROW), HALF)
         found = []
         for name, (value, agent, count) in texts.items():
-            high = float(margins[name].high.min())
+            high = _least(margins[name]).high
             text = Text(f"  {name:<{label}}  ")
             text.append(self._bar(name, high, half), style="red" if TOLERANCE.violated(high) else "green")
             text.append(f"  {value:<{wide[0]}}  {agent:<{wide[1]}}")
@@ -159,17 +162,16 @@ class LiveView:
             found.append(text)
         return found
 
-    def _texts(self, margin: Margins, unit: str) -> tuple[str, str, str]:
-        """Return three texts about a requirement; `margin` is its robustness for each agent.
+    def _texts(self, margins: Sequence[Margin], unit: str) -> tuple[str, str, str]:
+        """Return three texts about a requirement; `margins` are those of the agents.
 
         The texts are the least robustness with its unit, the agent that has it, and the number of agents that
         violate the requirement.
         """
-        row = int(margin.high.argmin())
-        open_ = margin.low[row] < margin.high[row]
-        count = int((margin.violated > 0).sum())
-        value = f"{'at most ' if open_ else ''}{_signed(float(margin.high[row]))} {unit}".rstrip()
-        return value, self._agent(row), f"violated by {count} of {len(margin.high)}" if count else ""
+        least, count = _least(margins), sum(margin.violated > 0 for margin in margins)
+        value = f"{'at most ' if least.low < least.high else ''}{_signed(least.high)} {unit}".rstrip()
+        agent = self._agent(margins.index(least))
+        return value, agent, f"violated by {count} of {len(margins)}" if count else ""
 
     def _bar(self, name: str, value: float, half: int = HALF) -> str:
         """Bar for a robustness value: to the left of the middle if negative, else to the right.
@@ -195,23 +197,26 @@ class LiveView:
         monitor, moment = self.monitor, self.monitor.moment
         assert moment is not None
         agents = range(monitor.setting.agents)
-        least: NDArray[np.float64] = np.min([each.high for each in monitor.margins.values()], axis=0)
-        rows = sorted(sorted(agents, key=lambda row: float(least[row]))[:most])
+        least = [min(each.high for each in found) for found in zip(*monitor.margins.values(), strict=True)]
+        rows = sorted(sorted(agents, key=least.__getitem__)[:most])
         states = moment.x[: len(agents)].tolist()
         names = monitor.task.system.signature.columns
         decision = moment.decision
         cells = []
         for row in rows:
             rho = "" if decision is None else _signed(float(decision.rho[row]))
-            name, margin = min(monitor.margins.items(), key=lambda each: float(each[1].high[row]))
-            worst = f"{name} {_signed(float(margin.high[row]))}"
-            first = (str(row), monitor.decided(row) or "", rho, worst)
+            name = next(name for name, found in monitor.margins.items() if found[row].high == least[row])
+            first = (str(row), monitor.decided(row) or "", rho, f"{name} {_signed(least[row])}")
             cells.append([*first, *map(_shown, names, states[row])])
         units = (f"{column.name} {column.unit.text}".strip() for column in names)
         lines = [Text(line) for line in _fitting(cells, [*FIRST, *units], width).splitlines()]
         for line, row in zip(lines[1:], rows, strict=True):
             line.stylize("red" if TOLERANCE.violated(least[row]) else "")
         return lines
+
+
+def _least(margins: Sequence[Margin]) -> Margin:
+    return min(margins, key=lambda margin: margin.high)
 
 
 def _fitting(cells: list[list[str]], header: list[str], width: int) -> str:
