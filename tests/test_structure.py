@@ -11,11 +11,12 @@ from helpers.tools import ROOT, load_tool
 structure = load_tool("structure")
 
 NODES = 462425
-CROSSINGS = 4.39
+CROSSINGS = 2033
+"""Names that modules take from other rooms; their ratio to the nodes rises when the package shrinks."""
 CIRCLES: set[tuple[str, str]] = set()
 IMPLEMENTATIONS = {
     "numbers of one step": 5,
-    "verdict on a requirement": 9,
+    "verdict on a requirement": 7,
     "online evaluator": 3,
     "arithmetic of bounds": 2,
     "choice among plans": 1,
@@ -52,7 +53,8 @@ def test_the_package_does_not_grow(ours):
 
 
 def test_borders_are_not_crossed_more_often(ours):
-    assert 1.0 < ours.crossings_per_1000 < CROSSINGS + 0.005
+    assert 1_000 < sum(map(len, ours.crossings.values())) <= CROSSINGS
+    assert ours.crossings_per_1000 < 4.5
 
 
 def test_rooms_that_import_each_other_become_fewer(ours):

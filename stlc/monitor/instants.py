@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.schedule import Boundary
-from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined_at
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.support import Reach
@@ -79,18 +78,41 @@ def rule_bounds(
     are unknown (`ends` is "open"), or the windows are clipped ("truncate"). Where a window begins beyond the
     end of the trace, the bounds hold wherever the trace may end.
     """
-    found = cut_bounds(rule, record, starts, horizon, ends)
+    found = _cut_bounds(rule, record, starts, horizon, ends)
     if ends == "open" or not (outside := beyond(rule, starts, record.samples, horizon)).any():
         return found
     if record.cells is not None or record.ops is not NUMPY:
         return widened(outside, found, rule_bounds(rule, record, starts, horizon, "open"))
-    formula = rule.under(record.semantics)
-    lower, upper = (prefix_bound(formula, end, cut=True) for end in ("lower", "upper"))
-    grown = replace(record, env=with_seen(record.env))
-    return widened(outside, found, growing_bounds(lower, upper, grown, starts, window_of(rule, horizon)))
+    return widened(outside, found, live_bounds(rule, record, starts, horizon, ends))
 
 
-def cut_bounds(
+def live_bounds(
+    rule: CompiledRequirement, record: Record, starts: range, horizon: int | None, ends: Ends
+) -> tuple[Array, Array]:
+    """`rule_bounds` of a trace that may go on after its last sample, and end with any."""
+    window, cut, parts = window_of(rule, horizon), ends == "truncate", []
+    settled = max(record.samples - span_of(rule, horizon).future, starts.start) if cut else starts.start
+    if known := range(starts.start, min(settled, starts.stop)):
+        parts.append(_cut_bounds(rule, record, known, horizon, ends))
+    if rest := range(known.stop, starts.stop):
+        formula, grown = rule.under(record.semantics), replace(record, env=with_seen(record.env))
+        lower, upper = (prefix_bound(formula, end, cut=cut) for end in ("lower", "upper"))
+        if window is None:
+            least, most = (lengthened(each, record.samples) for each in (lower, upper))
+            (low,) = grown.values([grown.sides(least)[0]], rest, "lower", FAR)
+            (high,) = grown.values([grown.sides(most)[1]], rest, "upper", FAR)
+        elif cut:
+            low, high = (
+                window_bounds(each, grown, rest, window, "open")[i] for i, each in enumerate((lower, upper))
+            )
+        else:
+            low, high = window_bounds(formula, grown, rest, window, "open")
+        parts.append((low, high))
+    low, high = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return low, high
+
+
+def _cut_bounds(
     rule: CompiledRequirement, record: Record, starts: range, horizon: int | None, ends: Ends
 ) -> tuple[Array, Array]:
     """`rule_bounds` in which a window that begins beyond the end of the trace is empty if `ends` cuts it."""
@@ -98,23 +120,6 @@ def cut_bounds(
     if window is None:
         return bounds(formula, record, starts, ends)
     return window_bounds(formula, record, starts, window, ends)
-
-
-def growing_bounds(
-    lower: ir.Formula, upper: ir.Formula, record: Record, starts: range, window: int | None
-) -> tuple[Array, Array]:
-    """Values of two bounds of `prefix_bound` at `starts`, each `(count, batch)`; the record may go on.
-
-    `window` is the number of samples from an instant to the `end` of its planning window, if that moves. The
-    record has the column `stlc.monitor.prefix_bounds.SEEN`.
-    """
-    if window is not None:
-        low, high = window_bounds(lower, record, starts, window, "open")
-        return low, high if upper == lower else window_bounds(upper, record, starts, window, "open")[1]
-    least, most = (lengthened(each, record.samples) for each in (lower, upper))
-    (low,) = record.values([record.sides(least)[0]], starts, "lower", FAR)
-    (high,) = record.values([record.sides(most)[1]], starts, "upper", FAR)
-    return low, high
 
 
 def beyond(rule: CompiledRequirement, starts: range, samples: int, horizon: int | None) -> NDArray[np.bool_]:

@@ -20,10 +20,10 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.tolerance import Status
 from stlc.diagnostics import usage
-from stlc.monitor.instants import cut_bounds, growing_bounds, rule_bounds, span_of, window_of
+from stlc.monitor.instants import live_bounds, rule_bounds, span_of, window_of
 from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.tally import Asked, Flags, JudgedInstants, RequirementSummary
-from stlc.monitor.prefix_bounds import FAR, prefix_bound, with_seen
+from stlc.monitor.prefix_bounds import FAR
 from stlc.monitor.values import Ends, Record
 
 MOST = 1 << 26
@@ -72,22 +72,9 @@ class GrowingBounds:
 
         The bounds are over all continuations; `ended`: the trace ends with the last sample.
         """
-        record, cut = Record.of(signals if ended else with_seen(signals)), self.ending == "truncate"
-        middle = min(max(self.settled(record.samples), starts.start), starts.stop) if cut else starts.start
-        known, rest = range(starts.start, middle), range(middle, starts.stop)
-        found: list[Floats] = []
-        for rule in self.rules:
-            parts, window, lower, upper = [], window_of(rule, self.horizon), rule.formula, rule.formula
-            if ended:
-                parts.append(rule_bounds(rule, record, starts, self.horizon, self.ending))
-            elif known:
-                parts.append(cut_bounds(rule, record, known, self.horizon, "truncate"))
-            if rest and not ended:
-                if window is None or cut:
-                    lower, upper = (prefix_bound(rule.formula, end, cut=cut) for end in ("lower", "upper"))
-                parts.append(growing_bounds(lower, upper, record, rest, window))
-            found += (np.concatenate(ends) for ends in zip(*parts, strict=True))
-        return np.concatenate(found, axis=1)
+        bounds, record = rule_bounds if ended else live_bounds, Record.of(signals)
+        found = (bounds(rule, record, starts, self.horizon, self.ending) for rule in self.rules)
+        return np.concatenate([end for ends in found for end in ends], axis=1)
 
 
 @final
