@@ -92,7 +92,13 @@ def uncertain_record(
     for name, values in given.items():
         known = uncertain.get(name, uncertain.get(_INDEX.sub("", name)))
         centre = values if isinstance(values, Intervals) else Intervals.point(values)
-        env[name] = centre if known is None else _around(centre, known, columns[name])
+        if known is not None:
+            factor = float(known.unit.ratio / columns[name].unit.ratio) if known.unit.text else 1.0
+            share, amount = known.relative * (1.0 + EPSILON), known.absolute * factor * (1.0 + 2.0 * EPSILON)
+            if share or amount:  # rounded outward
+                error = (mul(magnitudes(centre), share) + amount).high if share else amount
+                centre = widened(centre.low - error, centre.high + error)
+        env[name] = centre
     return replace(record, env=env, ops=INTERVALS, computed=False, holes=holes, cells=None)
 
 
@@ -107,16 +113,6 @@ def outer_of(values: Array, end: str) -> Array:
         return values
     low, high = values.low, values.high
     return low if end == "lower" else high if end == "upper" else np.where(low == high, low, math.nan)
-
-
-def _around(centre: Intervals, known: Uncertainty, column: Column) -> Intervals:
-    """Intervals around samples, in the unit of the signal and rounded outward."""
-    factor = float(known.unit.ratio / column.unit.ratio) if known.unit.text else 1.0
-    share, amount = known.relative * (1.0 + EPSILON), known.absolute * factor * (1.0 + 2.0 * EPSILON)
-    if not share and not amount:
-        return centre
-    error = (mul(magnitudes(centre), share) + amount).high if share else amount
-    return widened(centre.low - error, centre.high + error)
 
 
 def _misfit(
