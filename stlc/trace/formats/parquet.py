@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stlc.diagnostics import TraceError, usage
 from stlc.extras import needed
@@ -157,8 +156,14 @@ def _recording(path: Path, opened: _Opened, table: Any) -> Recording:
 def _values(name: str, chunked: Any) -> Mapping[str, Array]:
     """Return the values of a column, or of each component of a vector; raise ValueError if it has none."""
     kind = _kind(chunked.type)
+    if kind == "words":
+        dictionary = needed("pyarrow").types.is_dictionary(chunked.type)
+        encoded = chunked if dictionary else chunked.dictionary_encode()
+        array = encoded.unify_dictionaries().combine_chunks()
+        texts = np.array(["", *(str(word)[:MAX_LETTERS].strip() for word in array.dictionary.to_pylist())])
+        return {name: np.asarray(texts[np.asarray(array.indices.fill_null(-1), dtype=np.int64) + 1])}
     if kind != "lists":
-        return {name: _words(chunked) if kind == "words" else _numbers(chunked)}
+        return {name: _numbers(chunked)}
     lists = chunked.combine_chunks()
     there = np.asarray(lists.is_valid())
     lengths = np.asarray(needed("pyarrow.compute").list_value_length(lists.drop_null()))
@@ -170,13 +175,6 @@ def _values(name: str, chunked: Any) -> Mapping[str, Array]:
         flat, given = np.full((len(there), size), np.nan), flat
         flat[there] = given
     return {f"{name}[{i}]": np.ascontiguousarray(flat[:, i]) for i in range(size)}
-
-
-def _words(values: Any) -> NDArray[np.str_]:
-    encoded = values if needed("pyarrow").types.is_dictionary(values.type) else values.dictionary_encode()
-    array = encoded.unify_dictionaries().combine_chunks()
-    texts = np.array(["", *(str(word)[:MAX_LETTERS].strip() for word in array.dictionary.to_pylist())])
-    return np.asarray(texts[np.asarray(array.indices.fill_null(-1), dtype=np.int64) + 1])
 
 
 def _numbers(values: Any) -> Array:
