@@ -294,8 +294,14 @@ def with_visuals(urdf: Path, meshes: Mapping[str, str], folder: Path) -> Path:
             geometry = ElementTree.SubElement(ElementTree.SubElement(link, "visual"), "geometry")
             ElementTree.SubElement(geometry, "mesh", filename=str(mesh))
             continue
-        for end in ends.get(name, ()):
-            _rod(link, end)
+        for end in ends.get(name, ()):  # a rod from the link's origin, with a ball at its end
+            length = math.hypot(*end)
+            x, y, z = end
+            if length > ROD / 2:
+                turn = f"0 {math.acos(z / length):.9g} {math.atan2(y, x):.9g}"
+                middle, size = (x / 2, y / 2, z / 2), f"{length:.9g}"
+                _visual(link, middle, turn, "cylinder", radius=f"{ROD}", length=size)
+            _visual(link, end, "0 0 0", "sphere", radius=f"{1.3 * ROD:.9g}")
     path = folder / "robot.urdf"
     ElementTree.ElementTree(robot).write(path, encoding="utf-8")
     return path
@@ -311,16 +317,6 @@ def _ends(robot: ElementTree.Element) -> dict[str, list[tuple[float, float, floa
         if parent is not None:
             found.setdefault(parent.get("link", ""), []).append((x, y, z))
     return found
-
-
-def _rod(link: ElementTree.Element, end: tuple[float, float, float]) -> None:
-    """Add a rod from the link's origin to `end`, with a ball at `end`."""
-    length = math.hypot(*end)
-    x, y, z = end
-    if length > ROD / 2:
-        turn = f"0 {math.acos(z / length):.9g} {math.atan2(y, x):.9g}"
-        _visual(link, (x / 2, y / 2, z / 2), turn, "cylinder", radius=f"{ROD}", length=f"{length:.9g}")
-    _visual(link, end, "0 0 0", "sphere", radius=f"{1.3 * ROD:.9g}")
 
 
 def _visual(

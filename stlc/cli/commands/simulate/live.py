@@ -146,7 +146,13 @@ class LiveView:
         """
         margins = self.monitor.margins
         units = {rule.name: rule.typed.formula.margin_unit for rule in self.monitor.task.rules}
-        texts = {name: self._texts(found, units.get(name, "")) for name, found in margins.items()}
+        texts = {}
+        for name, each in margins.items():
+            least, violated = _least(each), sum(margin.violated > 0 for margin in each)
+            bound = "at most " if least.low < least.high else ""
+            value = f"{bound}{_signed(least.high)} {units.get(name, '')}".rstrip()
+            count = f"violated by {violated} of {len(each)}" if violated else ""
+            texts[name] = value, self._agent(each.index(least)), count
         wide = [max(len(parts[k]) for parts in texts.values()) for k in range(3)]
         label = max(map(len, margins))
         room = width - label - sum(wide) - len("      │      ")
@@ -161,17 +167,6 @@ class LiveView:
             text.rstrip()
             found.append(text)
         return found
-
-    def _texts(self, margins: Sequence[Margin], unit: str) -> tuple[str, str, str]:
-        """Return three texts about a requirement; `margins` are those of the agents.
-
-        The texts are the least robustness with its unit, the agent that has it, and the number of agents that
-        violate the requirement.
-        """
-        least, count = _least(margins), sum(margin.violated > 0 for margin in margins)
-        value = f"{'at most ' if least.low < least.high else ''}{_signed(least.high)} {unit}".rstrip()
-        agent = self._agent(margins.index(least))
-        return value, agent, f"violated by {count} of {len(margins)}" if count else ""
 
     def _bar(self, name: str, value: float, half: int = HALF) -> str:
         """Bar for a robustness value: to the left of the middle if negative, else to the right.
