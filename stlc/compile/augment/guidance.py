@@ -77,40 +77,31 @@ def _leaf(leaf: GoalLeaf) -> _Guidance | None:
     The goal is an absolute formula: its interval counts from the start of the mission. The deadline of
     `eventually@` and `until@` is the end of the interval. The deadline of `always@` is the start of the
     interval. The violation is 0 once the formula is true or false, or once the interval of `always@` has
-    begun. Recurring goals (`always@[a, end] once[0, c] p`) have another deadline, see `_recurring`.
+    begun. A recurring goal is `always@[a, end] once[0, c] p`, or a conjunction such as
+    `always@[a, end] (once[0, c] p and once[0, d] q)`. Its deadline is another: that of `once[0, c] p` is c
+    after the last sample at which p held.
     """
-    formula, window = leaf.formula, leaf.formula.window
-    if formula.op == "always" and window.hi is None and (recurring := _recurring(leaf)):
-        return recurring
+    formula, window, status = leaf.formula, leaf.formula.window, leaf.status
+    if formula.op == "always" and window.hi is None and status is not None:
+        body = formula.margin
+        parts = body.items if isinstance(body, ir.BoolOp) and body.op == "and" else (body,)
+        costs = [cost for part in parts if (cost := _recurring_part(part, leaf, status)) is not None]
+        if costs:
+            return _first_due(costs)
     promise = formula.op in ("eventually", "until")
     due = window.hi if promise else window.lo
-    if due is None or due == 0 or leaf.status is None or isinstance(formula.margin, ir.Truth):
+    if due is None or due == 0 or status is None or isinstance(formula.margin, ir.Truth):
         return None
     margin = _margin(formula.margin)
     if margin is None:
         return None
     left = ir.Const(float(due)) - leaf.clock
-    open_ = at_least(ir.Const(0.5), leaf.status.apply("abs"))
+    open_ = at_least(ir.Const(0.5), status.apply("abs"))
     waiting = open_ if promise else open_ & at_least(left, ir.Const(1.0))
-    lost = at_least(ir.Const(-0.5), leaf.status)
+    lost = at_least(ir.Const(-0.5), status)
     gap = (-margin).apply("relu")
     over = lost.select(_LOST, _DONE)
     return _Guidance(waiting.select(gap, _ZERO), waiting.select(left, over))
-
-
-def _recurring(leaf: GoalLeaf) -> _Guidance | None:
-    """Return the violation of a recurring goal and the time left for it; None for any other goal.
-
-    A recurring goal is `always@[a, end] once[0, c] p`, or a conjunction such as
-    `always@[a, end] (once[0, c] p and once[0, d] q)`. The deadline of `once[0, c] p` is c after the last
-    sample at which p held.
-    """
-    margin, status = leaf.formula.margin, leaf.status
-    if status is None:
-        return None
-    parts = margin.items if isinstance(margin, ir.BoolOp) and margin.op == "and" else (margin,)
-    costs = [cost for part in parts if (cost := _recurring_part(part, leaf, status)) is not None]
-    return _first_due(costs) if costs else None
 
 
 def _recurring_part(part: ir.Formula, leaf: GoalLeaf, status: ir.Signal) -> _Guidance | None:

@@ -134,9 +134,13 @@ def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
     The next status is true or false if the current sample decides the formula, else open. `clock` is the
     mission clock (steps since the start of the mission).
     """
-    inside, left, right = _inside(formula.window, clock), formula.left_now, formula.right_now
-    end = formula.window.hi
-    over = ir.Truth(False) if end is None else at_least(clock, ir.Const(float(end)))
+    window, left, right = formula.window, formula.left_now, formula.right_now
+    inside: ir.Formula = at_least(clock, ir.Const(float(window.lo)))
+    over: ir.Formula = ir.Truth(False)
+    if window.hi is not None:
+        end = ir.Const(float(window.hi))
+        not_over, over = at_least(end, clock), at_least(clock, end)
+        inside = not_over if window.lo == 0 else both(inside, not_over)
     match formula.op:
         case "always":
             return choose(both(inside, right.negated), _FALSE, choose(over, _TRUE, _OPEN))
@@ -150,15 +154,6 @@ def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
             return choose(left, _TRUE, failed)
         case _:
             assert_never(formula.op)
-
-
-def _inside(window: ir.Window, clock: ir.Signal) -> ir.Formula:
-    """Return a formula that holds while the mission clock (steps since the start) is within `window`."""
-    started = at_least(clock, ir.Const(float(window.lo)))
-    if window.hi is None:
-        return started
-    not_over = at_least(ir.Const(float(window.hi)), clock)
-    return not_over if window.lo == 0 else both(started, not_over)
 
 
 # ------------------------------------------------------------------------- progression
@@ -210,7 +205,10 @@ def _remainder(leaf: GoalLeaf, formula: Absolute, steps: int, *, alive: bool) ->
         return typed.Logic(span, "and", (possible(leaf), held)) if alive and leaf.status else held
     assert leaf.status is not None
     known = time_test(leaf.status, _KNOWN, span)
-    far = _beyond(formula, leaf.clock, steps)
+    end = formula.window.hi
+    far: typed.Formula = typed.Truth(span, end is None)  # holds while the window ends after the plan
+    if end is not None and end > steps:
+        far = time_test(ir.Const(float(end - steps - 1)), leaf.clock, span)
     match formula.op:
         case "eventually":
             soon = typed.Temporal(span, "eventually", plan, met)
@@ -261,21 +259,10 @@ def typed_inside(window: ir.Window, clock: ir.Signal, span: Span) -> typed.Formu
     """Return a typed formula that holds while the mission clock is within `window`.
 
     The mission clock counts the steps since the start of the mission. `span` becomes the source location of
-    the formula. `_inside` returns the same formula in the IR.
+    the formula. `_decided` has the same formula in the IR.
     """
     started = time_test(clock, ir.Const(float(window.lo)), span)
     if window.hi is None:
         return started
     not_over = time_test(ir.Const(float(window.hi)), clock, span)
     return not_over if window.lo == 0 else typed.Logic(span, "and", (started, not_over))
-
-
-def _beyond(formula: Absolute, clock: ir.Signal, steps: int) -> typed.Formula:
-    """Return a formula on the mission clock that holds while the window of `formula` ends after the plan.
-
-    `clock` counts the steps since the start of the mission. `steps` is the length of the plan.
-    """
-    hi = formula.window.hi
-    if hi is None or hi - steps < 1:
-        return typed.Truth(formula.span, hi is None)
-    return time_test(ir.Const(float(hi - steps - 1)), clock, formula.span)
