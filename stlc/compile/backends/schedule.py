@@ -195,9 +195,10 @@ def operands(
             return tuple((item, run) for item in items)
         case ir.Operator():
             parts, around = node.operands, node.offsets
-            runs = [
-                IndexRange(_first(read, run), _last(read, run, around[-1], parts, domain)) for read in around
-            ]
+            runs = []
+            for read in around:
+                first = 0 if read.first is None else at_least(run.start + read.first, 0)
+                runs.append(IndexRange(first, _last(read, run, around[-1], parts, domain)))
             runs = runs if runs[-1].count > 0 else [_NEVER] * len(runs)
             return tuple(zip(parts, runs, strict=True))
         case _:
@@ -205,11 +206,6 @@ def operands(
 
 
 _NEVER = IndexRange(0, -1)
-
-
-def _first(read: Offsets, run: IndexRange) -> Instant:
-    """First instant at which a formula with values at the instants `run` reads an operand, by its offsets."""
-    return 0 if read.first is None else at_least(run.start + read.first, 0)
 
 
 def _last(

@@ -368,29 +368,23 @@ def inputs(program: ArrayProgram, env: Mapping[str, Array], run: IndexRange, ops
     def read(name: str) -> Array:
         if name == ir.ELAPSED:
             return ops.counted(run.start, run.count, next(iter(env.values())))
-        if name in program.shifted:
-            return _shifted_rows(env[program.shifted[name].name], program.shifted[name], run, ops)
-        return _rows(env[name], run.start, run.count)
+        if name not in program.shifted:
+            return _rows(env[name], run.start, run.count)
+        # a read before the first sample gives the first sample, a read after the last gives the last
+        at = program.shifted[name]
+        column, start, count = env[at.name], run.start + at.steps, run.count
+        samples = len(column)
+        before, after = min(max(-start, 0), count), min(max(start + count - samples, 0), count)
+        if not before and not after:
+            return _rows(column, start, count)
+        inside = [column[max(start, 0) : min(start + count, samples)]] if before + after < count else []
+        return ops.cat([*[column[:1]] * before, *inside, *[column[-1:]] * after])
 
     return {name: read(name) for name in program.columns or list(env)[:1]}
 
 
 def _rows(column: Array, start: int, count: int) -> Array:
     return column if start == 0 and len(column) == count else column[start : start + count]
-
-
-def _shifted_rows(column: Array, at: ir.ShiftedSignal, run: IndexRange, ops: Ops) -> Array:
-    """Values of a signal `at.steps` samples after each instant in `run`: `(run.count, batch)`.
-
-    `column` holds all samples of the signal. A read before the first sample gives the first sample, and a
-    read after the last sample gives the last.
-    """
-    start, count, samples = run.start + at.steps, run.count, len(column)
-    before, after = min(max(-start, 0), count), min(max(start + count - samples, 0), count)
-    if not before and not after:
-        return _rows(column, start, count)
-    inside = [column[max(start, 0) : min(start + count, samples)]] if before + after < count else []
-    return ops.cat([*[column[:1]] * before, *inside, *[column[-1:]] * after])
 
 
 def _key_of(leaf: ir.Signal | ir.ShiftedSignal | ir.FrozenVar) -> str:

@@ -120,7 +120,12 @@ class Freezer:
         samples that the chunk needs.
         """
         ops, batch = self.ops, self._batch
-        for chunk in _chunks(run, _chunk_size(_MOST // batch, back + ahead, self.domain.samples)):
+        most, width = _MOST // batch, back + ahead
+        if math.isinf(width):  # each instant has a copy of the whole trace
+            size = most // self.domain.samples
+        else:  # the copies of `size` instants have size * (size + width) samples, at most `most`
+            size = int((math.sqrt(width * width + 4.0 * most) - width) / 2.0)
+        for chunk in _chunks(run, max(size, 1)):
             start = max(chunk.start - back, 0)
             stop = min(chunk.last + ahead + 1, self.domain.samples)
             begin, length = int(start), int(stop) - int(start)
@@ -177,17 +182,6 @@ def _neighbourhood(body: ir.Formula) -> tuple[float, float]:
         return math.inf, math.inf
     back = any(isinstance(node, ir.Windowed) and node.back and node.window.hi is None for node in body.walk())
     return math.inf if back else past, math.inf if body.uses_end else future
-
-
-def _chunk_size(most: int, width: float, samples: int) -> int:
-    """Number of instants to evaluate together, so that at most `most` values are needed; at least 1.
-
-    If c instants are evaluated together, each has its own copy of c + width samples: c * (c + width) values
-    in total. If `width` is infinite, each instant has a copy of the whole trace, which has `samples` samples.
-    """
-    if math.isinf(width):
-        return max(most // samples, 1)
-    return max(int((math.sqrt(width * width + 4.0 * most) - width) / 2.0), 1)
 
 
 def _chunks(run: IndexRange, size: int) -> Iterator[IndexRange]:

@@ -208,7 +208,8 @@ class Machine:
             case ir.Shift():
                 return self._shift(node, run, operands)
             case ir.AtStart():
-                return self._repeated(run.count)
+                full, rows = self.windows.ops.full, run.count
+                return lambda parts, like: parts[0] + full((rows, *like.shape[1:]), 0.0, like)
             case ir.Predicate() | ir.Freeze():
                 raise TypeError("predicates and frozen values come from programs")
             case _:
@@ -217,10 +218,6 @@ class Machine:
     def _constant(self, rows: int, value: float) -> Kernel:
         full = self.windows.ops.full
         return lambda _, like: full((rows, *like.shape[1:]), value, like)
-
-    def _repeated(self, rows: int) -> Kernel:
-        full = self.windows.ops.full
-        return lambda parts, like: parts[0] + full((rows, *like.shape[1:]), 0.0, like)
 
     def _future(self, window: ir.Window, run: IndexRange, operands: int, pick: Pick) -> Kernel:
         """Function that computes a temporal operator over future windows at the instants `run`.
@@ -315,7 +312,9 @@ def _runner(
 ) -> Runner:
     """Return the function that computes the values of a step; `source`: that of the margin of a predicate."""
     if isinstance(step.node, ir.Freeze):
-        return _frozen(step.node, step.run, machine)
+        node, run, domain, windows = step.node, step.run, machine.domain, machine.windows
+        judge = partial(_judge, windows=windows)
+        return lambda _, __, env, ___: Freezer(domain, env, windows.ops, judge).values(node, run)
     if isinstance(step.node, ir.Predicate):
         return _predicate(step, machine, source, batches)
     kernel, parts = machine.bind(step), step.operands
@@ -348,12 +347,6 @@ def _predicate(
         return lambda _, outputs, __, like: kernel((outputs[number][name],), like)
     rows = slice(offset, offset + inside.count)
     return lambda _, outputs, __, like: kernel((outputs[number][name][rows],), like)
-
-
-def _frozen(node: ir.Freeze, run: IndexRange, machine: Machine) -> Runner:
-    domain, windows = machine.domain, machine.windows
-    judge = partial(_judge, windows=windows)
-    return lambda _, __, env, ___: Freezer(domain, env, windows.ops, judge).values(node, run)
 
 
 def _judge(

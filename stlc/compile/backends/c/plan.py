@@ -208,8 +208,10 @@ class _Planner(Scheduler):
 
         If there is no such step yet, it is added, outside of all loops on which its value does not depend.
         """
-        node = _split(node)
-        depth = self._depth(node)
+        node, depth = _split(node), 0  # depth: of the innermost enclosing loop on which the value depends
+        if len(self.scopes) > 1:
+            read = _frozen_names(node)
+            depth = max((depth for depth, scope in enumerate(self.scopes) if read & scope.read), default=0)
         around = self.scopes[depth + 1 :]
         if not around:
             return super().place(node, run)
@@ -234,13 +236,6 @@ class _Planner(Scheduler):
             yield self.scope
         finally:
             self.scopes, self.scope = before, before[-1]
-
-    def _depth(self, formula: ir.Formula) -> int:
-        """Depth of the innermost enclosing loop on which a formula's value depends; 0 if there is none."""
-        if len(self.scopes) == 1:
-            return 0
-        read = _frozen_names(formula)
-        return max((depth for depth, scope in enumerate(self.scopes) if read & scope.read), default=0)
 
     def scheduled(self, node: ir.Formula, run: IndexRange) -> int:
         """Add the step that computes the formula `node` at the instants `run`; return the step's number.
@@ -338,14 +333,12 @@ class _Planner(Scheduler):
         for part in num.subexpressions():
             key = call_of(part)
             if key is not None and key not in self.calls:
-                self._call(key, part)
-
-    def _call(self, key: CallKey, num: ir.Num) -> None:
-        assert isinstance(num, ir.Extern)
-        whole, called = IndexRange(0, self.domain.samples - 1), Called(replace(num, args=key[1], output=0))
-        with self._inside(self.scopes[:1]):
-            first, *_ = [self.number(whole) for _ in called.components]
-            self.calls[key] = self.add(ScheduleStep(called, whole, (), number=first))
+                assert isinstance(part, ir.Extern)
+                whole = IndexRange(0, self.domain.samples - 1)
+                called = Called(replace(part, args=key[1], output=0))
+                with self._inside(self.scopes[:1]):
+                    first, *_ = [self.number(whole) for _ in called.components]
+                    self.calls[key] = self.add(ScheduleStep(called, whole, (), number=first))
 
 
 def call_of(num: ir.Num) -> CallKey | None:

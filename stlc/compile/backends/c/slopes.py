@@ -120,8 +120,12 @@ class SlopeWriter(NumberWriter):
         if self._unbounded.intersection(args) or any(map(self._varies, critical)) or NOUGHT in critical:
             self._unbounded.add(register)
         derivative = function.slopes
-        if name == "clip":
-            slopes = self._clipped(*args)
+        if name == "clip":  # derivatives of min(max(x, low), high)
+            x, low, high = args
+            raised = super()._apply("max", [x, low])
+            of_x, of_low = self._shares("max", x, low)
+            of_raised, of_high = self._shares("min", raised, high)
+            slopes = [(x, f"({of_x} * {of_raised})"), (low, f"({of_low} * {of_raised})"), (high, of_high)]
         elif callable(derivative):
             slopes = [each for each in zip(args, derivative(register, *args), strict=True) if each[1] != FLAT]
         else:
@@ -146,16 +150,6 @@ class SlopeWriter(NumberWriter):
     def _varies(self, operand: str) -> bool:
         """True if an operand depends on a signal; constants and functions of constants do not."""
         return operand in self._texts.values() and operand not in self._constants
-
-    def _clipped(self, x: str, low: str, high: str) -> list[Slope]:
-        """Derivatives of `min(max(x, low), high)` with respect to the three arguments.
-
-        Returns pairs of an argument and the C expression of the derivative with respect to it.
-        """
-        raised = super()._apply("max", [x, low])
-        of_x, of_low = self._shares("max", x, low)
-        of_raised, of_high = self._shares("min", raised, high)
-        return [(x, f"({of_x} * {of_raised})"), (low, f"({of_low} * {of_raised})"), (high, of_high)]
 
     def _remember(self, register: str, slopes: list[Slope]) -> None:
         registers = set(self._texts.values())

@@ -127,7 +127,10 @@ class OnnxOps(FloatConstants, ScanByRows):
         longer = tall.apply("Max", wide)
         none = longer.apply("Equal", 0.0, kind="bool")
         slope = tall.apply("Min", wide) / self.where(none, 1.0, longer)
-        angle = _flat(slope)
+        angle = slope.cast("float32").apply("Atan").cast(slope.kind)
+        if slope.kind != "float32":  # improve by one Newton step
+            sine, cosine = angle.apply("Sin"), angle.apply("Cos")
+            angle = angle + (slope * cosine - sine) / (cosine + slope * sine)
         angle = self.where(self.gt(tall, wide), math.pi / 2 - angle, angle)
         angle = self.where(_negative(x), math.pi - angle, angle)
         return self.where(_negative(y), -angle, angle)
@@ -249,15 +252,6 @@ class OnnxOps(FloatConstants, ScanByRows):
 def _negative(x: Value) -> Value:
     """Mask that is True where `x` is negative or -0."""
     return ONNX_OPS.where(x.apply("Equal", 0.0, kind="bool"), 1.0 / x, x).apply("Less", 0.0, kind="bool")
-
-
-def _flat(slope: Value) -> Value:
-    """Arc tangent of a slope in [0, 1]: computed in float32, then improved by one Newton step."""
-    near = slope.cast("float32").apply("Atan").cast(slope.kind)
-    if slope.kind == "float32":
-        return near
-    sine, cosine = near.apply("Sin"), near.apply("Cos")
-    return near + (slope * cosine - sine) / (cosine + slope * sine)
 
 
 def _running(x: Value, op: str) -> Value:

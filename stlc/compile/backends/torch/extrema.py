@@ -175,15 +175,13 @@ def _run(
 ) -> tuple[Tensor, ...]:
     """Run the kernel on `arrays`; return the arrays of `rows` rows that it fills."""
     operands = kernel.operands
-    out = tuple(_like(each, rows) for each in arrays[: operands if direction == "pull" else 1])
+    out = []
+    for x in arrays[: operands if direction == "pull" else 1]:  # uninitialized, with the same memory layout
+        batch = x.shape[1]
+        by_column = x.stride(0) == 1 and batch > 1
+        out.append(x.new_empty((batch, rows)).T if by_column else x.new_empty((rows, batch)))
     kernel.run([Strided(x.data_ptr(), *x.stride()) for x in (*arrays, *out)], direction)
-    return out
-
-
-def _like(x: Tensor, rows: int) -> Tensor:
-    """Uninitialized array of `rows` rows with the memory layout of `x`."""
-    batch = x.shape[1]
-    return x.new_empty((batch, rows)).T if x.stride(0) == 1 and batch > 1 else x.new_empty((rows, batch))
+    return tuple(out)
 
 
 # ------------------------------------------------------------------ windows over few numbers
