@@ -229,7 +229,11 @@ def _shifted(value: Value, delay: typed.Time, expr: ast.Expr, span: Span, name: 
         case Number() if value.kind != "bool":
             return replace(value, num=_delayed_number(value.num, delay), origin=None)
         case VectorValue(items):
-            return VectorValue(tuple(_later(item, delay, span) for item in items), span=span)
+            shifted = []
+            for item in items:  # a number such as `if c then p else q`, with bools p and q, has a formula too
+                formula = None if item.formula is None else _delayed_formula(item.formula, delay, span)
+                shifted.append(replace(item, num=_delayed_number(item.num, delay), formula=formula))
+            return VectorValue(tuple(shifted), span=span)
         case _:
             return _delayed_formula(as_formula(value, expr, Expectation(name), scope), delay, span)
 
@@ -244,15 +248,6 @@ def _delayed_formula(formula: typed.Formula, delay: typed.Time, span: Span) -> t
     if delay.seconds or delay.horizons:
         return typed.Shift(span, 1, formula, delay=delay)
     return typed.Shift(span, int(delay.steps), formula)
-
-
-def _later(number: Number, delay: typed.Time, span: Span) -> Number:
-    """Return `number`, a component of a vector, shifted in time by `delay`.
-
-    The formula of a number such as `if c then p else q`, with bools p and q, is shifted too.
-    """
-    formula = None if number.formula is None else _delayed_formula(number.formula, delay, span)
-    return replace(number, num=_delayed_number(number.num, delay), formula=formula)
 
 
 def _delta(value: Value, expr: ast.Expr, span: Span, scope: Scope) -> Value:
@@ -331,38 +326,27 @@ def outside(entry: External, call: ast.Call, values: Sequence[Value], scope: Sco
         )
         if size is None:
             number = loose_number(value, arg.value, need, scope)
-            if entry.units:
-                number = _argument(number, entry.units[index], need, arg.span, scope)
+            unit = entry.units[index] if entry.units else None
+            if unit is not None and number.bare:
+                number = in_unit(number, unit, scope)
+            elif unit is not None and not number.flexible and not number.unit.same_dims(unit):
+                message = f"{need.who} in [{unit}], this is in [{number.unit}]"
+                scope.fail(Diagnostic("E203", message, arg.span))
             flat.append(absolute(number).num)
             continue
         vector = as_vector(value, arg.value, need, scope)
         if len(vector.items) != size:
             scope.fail(Diagnostic("E205", f"{need.who}, this has {len(vector.items)} components", arg.span))
         flat += [absolute(item).num for item in vector.items]
-    numbers = [_output(entry, index, (*flat, *entry.further)) for index in range(entry.result or 1)]
+    numbers = []
+    for index in range(entry.result or 1):
+        num: ir.Num = ir.Extern(entry.name, (*flat, *entry.further), index, entry.function)
+        if entry.unit.ratio != 1:
+            num = num * entry.unit.scale
+        numbers.append(Number(num, entry.unit, flexible=not entry.unit.text, kind=entry.kind))
     if entry.result is None:
         return replace(numbers[0], span=call.span)
     return VectorValue(tuple(numbers), span=call.span)
-
-
-def _argument(number: Number, unit: Unit, need: Expectation, span: Span, scope: Scope) -> Number:
-    """Return the argument of a function that takes a number in `unit`.
-
-    Raises:
-        Failed: the number has other dimensions (E203).
-    """
-    if number.bare:
-        return in_unit(number, unit, scope)
-    if not number.flexible and not number.unit.same_dims(unit):
-        scope.fail(Diagnostic("E203", f"{need.who} in [{unit}], this is in [{number.unit}]", span))
-    return number
-
-
-def _output(entry: External, index: int, args: tuple[ir.Num, ...]) -> Number:
-    num: ir.Num = ir.Extern(entry.name, args, index, entry.function)
-    if entry.unit.ratio != 1:
-        num = num * entry.unit.scale
-    return Number(num, entry.unit, flexible=not entry.unit.text, kind=entry.kind)
 
 
 def builtin(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:

@@ -51,7 +51,10 @@ def as_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> 
         case typed.Formula():
             return scope.fail(_formula_for_number(value, expr, need))
         case TimeExpr():
-            return scope.fail(_time_for_number(value, expr))
+            if value.end:
+                message = f"`{expr.span.text}` is only known as the end of an interval"
+                scope.fail(Diagnostic("E205", message, expr.span))
+            return scope.fail(out_of_place(expr.span))
         case _:
             message = f"{need.who}; {need.which} is {noun(value)}"
             return scope.fail(Diagnostic("E205", message, expr.span, describe(value)))
@@ -88,7 +91,10 @@ def as_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) ->
         case typed.Formula():
             return value
         case _:
-            return scope.fail(_number_for_formula(value, expr, need))
+            labels = () if need.span is None else (need.span.label("wants something that is true or false"),)
+            message = f"{need.who} needs a formula, {need.which} is {noun(value)}"
+            help_ = _as_comparison(value, expr)
+            return scope.fail(Diagnostic("E201", message, expr.span, describe(value), labels, help=help_))
 
 
 def as_state_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> ir.Formula:
@@ -144,12 +150,6 @@ def member_number(member: Member, span: Span, scope: Scope) -> Number:
     return Number(ir.Const(float(values.pop())), kind="enum", labels=labels, span=span)
 
 
-def _number_for_formula(value: Value, expr: ast.Expr, need: Expectation) -> Diagnostic:
-    labels = () if need.span is None else (need.span.label("wants something that is true or false"),)
-    message = f"{need.who} needs a formula, {need.which} is {noun(value)}"
-    return Diagnostic("E201", message, expr.span, describe(value), labels, help=_as_comparison(value, expr))
-
-
 def _as_comparison(value: Value, expr: ast.Expr) -> tuple[str, ...]:
     text = expr.span.text
     match value, expr:
@@ -175,10 +175,3 @@ def _formula_for_number(value: typed.Formula, expr: ast.Expr, need: Expectation)
             " a temporal operator has no numeric form in a predicate",
         )
     return Diagnostic("E202", message, expr.span, "formula", help=help_)
-
-
-def _time_for_number(value: TimeExpr, expr: ast.Expr) -> Diagnostic:
-    text = expr.span.text
-    if value.end:
-        return Diagnostic("E205", f"`{text}` is only known as the end of an interval", expr.span)
-    return out_of_place(expr.span)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -24,7 +24,7 @@ from stlc.compile.frontend.scope import (
     member_entries,
 )
 from stlc.compile.frontend.tags import refuse_tags, require_between
-from stlc.compile.frontend.values import Number, TimeExpr, Value, VectorValue
+from stlc.compile.frontend.values import Number, TimeExpr, VectorValue
 from stlc.compile.ir.functions import FUNCTIONS, callable_names, sampler_names
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
@@ -53,7 +53,8 @@ def check_names(entry: Definition, scope: Scope) -> None:
 def _free(node: object, bound: frozenset[str]) -> Iterator[tuple[ast.Name, bool]]:
     """Yield each free name in an expression, and whether the name is called as a function.
 
-    A name is not free if it is in `bound`, or if a quantifier or a `freeze` in the expression binds it.
+    A name is not free if it is in `bound`, or if a quantifier or a `freeze` in the expression binds it. Names
+    of modules are left out.
     """
     if isinstance(node, ast.Name):
         if node.name not in bound:
@@ -61,7 +62,13 @@ def _free(node: object, bound: frozenset[str]) -> Iterator[tuple[ast.Name, bool]
         return
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
         yield node.func, True
-    for part in _parts(node):
+    parts: Iterable[object] = ()
+    if isinstance(node, tuple):
+        parts = node
+    elif isinstance(node, ast.Node) and not isinstance(node, ast.Attr):
+        skipped = ("span", "func") if isinstance(node, ast.Call) else ("span",)
+        parts = [getattr(node, field.name) for field in fields(node) if field.name not in skipped]
+    for part in parts:
         yield from _free(part, bound | _binds(node))
 
 
@@ -73,15 +80,6 @@ def _binds(node: object) -> frozenset[str]:
             return frozenset(name for name, _ in bindings)
         case _:
             return frozenset()
-
-
-def _parts(node: object) -> Iterator[object]:
-    """Yield the children of a syntax node, except the names of called functions and of modules."""
-    if isinstance(node, tuple):
-        yield from node
-    elif isinstance(node, ast.Node) and not isinstance(node, ast.Attr):
-        skipped = ("span", "func") if isinstance(node, ast.Call) else ("span",)
-        yield from (getattr(node, field.name) for field in fields(node) if field.name not in skipped)
 
 
 _EXTERN_KINDS: dict[str, Kind] = {"real": "real", "int": "int", "bool": "bool"}
@@ -488,7 +486,13 @@ class _EntryBuilder:
             entry = Known(column_value(columns[0]), about, item.name_span)
         else:
             (entry,) = column_entries(columns, about=about, span=item.name_span).values()
-        return replace(entry, value=_read_in(entry.value, unit)) if unit.text else entry
+        value = entry.value
+        if unit.text and isinstance(value, VectorValue):  # the system may store it in another unit
+            items = tuple(rebased(item, unit) for item in value.items)
+            return replace(entry, value=replace(value, items=items))
+        if unit.text and isinstance(value, Number):
+            return replace(entry, value=rebased(value, unit))
+        return entry
 
     def parameter(self, item: ast.Param) -> Entry:
         if item.name not in self.overrides:
@@ -529,10 +533,3 @@ _ENTRIES: Mapping[type, Callable[[_EntryBuilder, Any], Entry]] = {
 
 def _about(item: ast.Declaration) -> str:
     return f"{_keyword(item)}, declared at line {item.name_span.line}"
-
-
-def _read_in(value: Value, unit: Unit) -> Value:
-    """Return the value of a signal, which the system may store in another unit, converted to `unit`."""
-    if isinstance(value, VectorValue):
-        return replace(value, items=tuple(rebased(item, unit) for item in value.items))
-    return rebased(value, unit) if isinstance(value, Number) else value

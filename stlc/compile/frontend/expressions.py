@@ -57,7 +57,13 @@ def resolve_state_formula(expr: ast.Expr, scope: Scope, *, what: str = "a condit
         StlcError: of class `scope.error`, with the findings.
     """
     with _raising(scope):
-        formula = _formula(evaluate(expr, scope), expr, what, scope)
+        value = evaluate(expr, scope)
+        fits = isinstance(value, typed.Formula) or (isinstance(value, Number) and value.kind == "bool")
+        if not fits and not scope.in_spec:
+            help_ = (f"`{expr.span.text} > 0`",) if isinstance(value, Number) and not value.labels else ()
+            message = f"{what} must be a formula, this is {noun(value)}"
+            scope.fail(Diagnostic("S203", message, expr.span, describe(value), help=help_))
+        formula = as_formula(value, expr, Expectation(what), scope)
         if not formula.is_state():
             scope.fail(Diagnostic("E202", f"{what} speaks about one instant", expr.span, "temporal"))
         return condition(formula)
@@ -87,15 +93,6 @@ def resolve_formula(expr: ast.Expr, scope: Scope, *, what: str = "a requirement"
     """
     with scope.meter.fresh():
         return as_formula(evaluate(expr, scope), expr, Expectation(what), scope)
-
-
-def _formula(value: Value, expr: ast.Expr, what: str, scope: Scope) -> typed.Formula:
-    fits = isinstance(value, typed.Formula) or (isinstance(value, Number) and value.kind == "bool")
-    if not fits and not scope.in_spec:
-        help_ = (f"`{expr.span.text} > 0`",) if isinstance(value, Number) and not value.labels else ()
-        message = f"{what} must be a formula, this is {noun(value)}"
-        scope.fail(Diagnostic("S203", message, expr.span, describe(value), help=help_))
-    return as_formula(value, expr, Expectation(what), scope)
 
 
 def resolve_number(

@@ -119,19 +119,19 @@ class _Rewriting:
             case ast.Binary(op="+" | "-" | "*" | "/" as op, left=left, right=right):
                 first = self.within(left)
                 beside = right if first else left
-                grows = self._positive(beside, op, first) if op in "*/" else first or op == "+"
+                if op in "*/":
+                    factor = self.evaluate(beside, self.scope)
+                    if (op == "/" and not first) or not isinstance(factor, Number) or not factor.constant:
+                        misplaced(self.extreme, self.scope)
+                    grows = factor.constant > 0
+                else:
+                    grows = first or op == "+"
                 inner_grows, inner = self.opened(left if first else right)
                 held = self.held(beside)
                 sides = (inner, held) if first else (held, inner)
                 return grows == inner_grows, replace(expr, left=sides[0], right=sides[1])
             case _:
                 misplaced(self.extreme, self.scope)
-
-    def _positive(self, factor: ast.Expr, op: str, first: bool) -> bool:
-        value = self.evaluate(factor, self.scope)
-        if (op == "/" and not first) or not isinstance(value, Number) or not value.constant:
-            misplaced(self.extreme, self.scope)
-        return value.constant > 0
 
     def over(self, body: ast.Expr, *, universal: bool) -> ast.Expr:
         """Return `body` at every (`universal`) or some sample of the window, whose bounds may be negative."""

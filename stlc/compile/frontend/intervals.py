@@ -48,7 +48,11 @@ def combine(op: str, left: Operand, right: Operand, span: Span, scope: Scope) ->
         and not times.value.end
         and not (op == "/" and times is right)
     ):
-        share = _factor(*factor, scope)
+        number = factor.value
+        if not isinstance(number, Number) or number.constant is None or not number.unit.dimensionless:
+            message = f"a time is multiplied by a plain number, this is {noun(number)}"
+            scope.fail(Diagnostic("E205", message, factor.expr.span))
+        share = number.exact if number.exact is not None else Fraction(repr(number.constant))
         if op == "/" and share == 0:
             scope.fail(Diagnostic("E401", "division by zero", factor.expr.span, "is 0"))
         return times.value.times(1 / share if op == "/" else share)
@@ -71,14 +75,6 @@ def negative(value: TimeExpr, span: Span, scope: Scope) -> TimeExpr:
     if value.end:
         scope.fail(Diagnostic("E205", "`end` has no sign", span))
     return value.times(Fraction(-1))
-
-
-def _factor(expr: ast.Expr, value: Value, scope: Scope) -> Fraction:
-    if isinstance(value, Number) and value.constant is not None and value.unit.dimensionless:
-        return value.exact if value.exact is not None else Fraction(repr(value.constant))
-    return scope.fail(
-        Diagnostic("E205", f"a time is multiplied by a plain number, this is {noun(value)}", expr.span)
-    )
 
 
 def moment(expr: ast.Expr, value: Value, scope: Scope) -> TimeExpr:
@@ -178,7 +174,11 @@ def interval(
     if sign(low) < 0 or (not high.end and sign(high) < 0):
         scope.fail(_negative(op, node, (low, high), body))
     if not high.end and sign(high.plus(low, -1)) < 0:
-        scope.fail(_reversed(node))
+        first, last = node.lo.span, node.hi.span
+        fix = Fix(((first, last.text), (last, first.text)), f"write `[{last.text}, {first.text}]`")
+        label = f"{first.text} > {last.text}"
+        message = "the interval ends before it starts"
+        scope.fail(Diagnostic("E301", message, first.to(last), label, fix=fix))
     lo, hi = low.on(low.span), None if high.end else high.on(high.span)
     return typed.Interval(lo, hi, node.lo_open, node.hi_open, node.clock, node.span)
 
@@ -192,14 +192,6 @@ def sign(value: TimeExpr) -> int:
     if all(part <= 0 for part in parts):
         return -1 if any(parts) else 0
     return 1
-
-
-def _reversed(node: ast.Interval) -> Diagnostic:
-    low, high = node.lo.span, node.hi.span
-    edits = ((low, high.text), (high, low.text))
-    label = f"{low.text} > {high.text}"
-    fix = Fix(edits, f"write `[{high.text}, {low.text}]`")
-    return Diagnostic("E301", "the interval ends before it starts", low.to(high), label, fix=fix)
 
 
 def _negative(name: str, node: ast.Interval, ends: tuple[TimeExpr, TimeExpr], body: ast.Expr) -> Diagnostic:

@@ -60,7 +60,12 @@ def finished(entry: Definition, value: Value, scope: Scope) -> Value:
             _check_constant(entry, value, scope)
         case "any":
             pass
-    return value if entry.unit is None else _in_unit(value, entry.unit, body.span, scope)
+    if entry.unit is not None and isinstance(value, VectorValue):
+        items = tuple(_number_in(item, entry.unit, body.span, scope) for item in value.items)
+        return replace(value, items=items)
+    if entry.unit is not None and isinstance(value, Number):
+        return _number_in(value, entry.unit, body.span, scope)
+    return value
 
 
 def _check_constant(entry: Definition, value: Value, scope: Scope) -> None:
@@ -72,14 +77,6 @@ def _check_constant(entry: Definition, value: Value, scope: Scope) -> None:
         message = f"`const {entry.name}` must be a number that is known at compile time"
         help_ = (f"def {entry.name} = {entry.body.span.text}",)
         scope.fail(Diagnostic("E205", message, entry.body.span, f"this is {noun(value)}", help=help_))
-
-
-def _in_unit(value: Value, unit: Unit, span: Span, scope: Scope) -> Value:
-    """Return a value in the declared unit. Raises Failed (E203) if a number has another unit."""
-    if isinstance(value, VectorValue):
-        items = tuple(_number_in(item, unit, span, scope) for item in value.items)
-        return replace(value, items=items)
-    return _number_in(value, unit, span, scope) if isinstance(value, Number) else value
 
 
 def _number_in(number: Number, unit: Unit, span: Span, scope: Scope) -> Number:

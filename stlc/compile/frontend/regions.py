@@ -214,7 +214,11 @@ def _box(point: VectorValue, lower: VectorValue, upper: VectorValue, span: Span,
 def _polygon(point: VectorValue, corners: Sequence[VectorValue], span: Span, scope: Scope) -> Number:
     """Return the signed distance to a polygon: the distance to the nearest edge, negative outside."""
     nearest = apply("min", [to_segment(point, a, b, span, scope) for a, b in edges(corners)], span, scope)
-    parts = [_left_of_all(point, triangle, span, scope) for triangle in triangles(corners)]
+    parts = []
+    for triangle in triangles(corners):
+        sides = (side(point, start, end, span, scope) for start, end in edges(triangle))
+        left_of_all = tuple(ir.Predicate(each.num, span=span) for each in sides)
+        parts.append(ir.BoolOp("and", left_of_all, span))
     inside = parts[0] if len(parts) == 1 else ir.BoolOp("or", tuple(parts), span)
     return Number(
         inside.select(nearest.num, negated(nearest, span).num), nearest.unit, nearest.flexible, span=span
@@ -239,9 +243,3 @@ def side(point: VectorValue, start: VectorValue, end: VectorValue, span: Span, s
     found = cross(minus(end, start, span, scope), minus(point, start, span, scope), span, scope)
     assert isinstance(found, Number)
     return found
-
-
-def _left_of_all(point: VectorValue, corners: Sequence[VectorValue], span: Span, scope: Scope) -> ir.Formula:
-    """Return the formula that a point is left of all edges of a polygon; corners counter-clockwise."""
-    sides = (side(point, start, end, span, scope) for start, end in edges(corners))
-    return ir.BoolOp("and", tuple(ir.Predicate(each.num, span=span) for each in sides), span)

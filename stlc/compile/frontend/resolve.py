@@ -22,7 +22,7 @@ from stlc.compile.frontend.expressions import resolve_formula
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.parameters import parameters, read_overrides
 from stlc.compile.frontend.scope import Definition, Failed, Scope
-from stlc.compile.frontend.tags import Tags, reach_of_formula, reach_of_number, read_tags
+from stlc.compile.frontend.tags import reach_of_formula, reach_of_number, read_tags
 from stlc.compile.frontend.values import Number, Value, VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
@@ -61,16 +61,15 @@ def declared(
     scope: Scope,
 ) -> File:
     """Return a file with its declarations and those of its imports; findings go to `scope`."""
-    loaded = [(module.alias, _of_module(module, interface, scope)) for module in modules]
+    loaded = []
+    for module in modules:
+        time_unit = module.spec.time_unit or scope.time_unit
+        blank = replace(scope, entries={}, cache={}, time_unit=time_unit)
+        loaded.append((module.alias, declared(module.spec, module.imports, interface, {}, blank)))
     found = declare(spec, interface, overrides, scope)
     scopes = {alias: file.scope for alias, file in loaded}
     own = replace(scope, entries=found.entries, cache=dict.fromkeys(found.broken), modules=scopes)
     return File(spec, found, own, tuple(file for _, file in loaded))
-
-
-def _of_module(module: Module, interface: Interface | None, scope: Scope) -> File:
-    blank = replace(scope, entries={}, cache={}, time_unit=module.spec.time_unit or scope.time_unit)
-    return declared(module.spec, module.imports, interface, {}, blank)
 
 
 def signature_of(file: File, interface: Interface | None) -> tuple[Signature, tuple[typed.Parameter, ...]]:
@@ -337,7 +336,13 @@ def _requirements(
         here = scope.as_products() if tags.product else scope
         try:
             formula = resolve_formula(item.formula, here, what=what)
-            scale = _scale(tags, formula, ranges, scope)
+            place = tags.scale_span or formula.span
+            if tags.scale is None:
+                scale = reach_of_formula(formula, ranges, place, scope)
+            elif isinstance(tags.scale, ir.Const):
+                scale = tags.scale.value
+            else:
+                scale = reach_of_number(tags.scale, ranges, place, scope)
         except Failed:
             continue
         found.append(
@@ -355,20 +360,6 @@ def _requirements(
             )
         )
     return tuple(found)
-
-
-def _scale(tags: Tags, formula: typed.Formula, ranges: Mapping[str, Bounds], scope: Scope) -> float:
-    """Return the number by which the robustness of a requirement is divided, as given by the tag `@scale`.
-
-    Raises:
-        Failed: the divisor depends on a signal whose range is unknown (E205).
-    """
-    if isinstance(tags.scale, ir.Const):
-        return tags.scale.value
-    place = tags.scale_span or formula.span
-    if tags.scale is None:
-        return reach_of_formula(formula, ranges, place, scope)
-    return reach_of_number(tags.scale, ranges, place, scope)
 
 
 def _warnings(

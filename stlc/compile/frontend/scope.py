@@ -280,7 +280,11 @@ class Scope:
         pairs = len(candidates) * (1 + len(self.sink))
         near = closest(name.name, candidates) if pairs <= _MAX_PAIRS else None
         what = "function" if called else "name"
-        help_ = () if near is None else (f"did you mean `{near}`?{self._about(near)}",)
+        help_: tuple[str, ...] = ()
+        if near is not None:
+            entry = self.entries.get(near)
+            about = f"  ({entry.about})" if entry is not None and entry.about else ""
+            help_ = (f"did you mean `{near}`?{about}",)
         if name.name == "t" and self.in_spec:
             help_ = (
                 "a signal's name is its value now: `x`, not `x[t]`; other samples: `prev(x)`, `shift(x, 1)`",
@@ -289,10 +293,6 @@ class Scope:
             help_ = (self.system_hints[name.name],)
         note = () if called or not self.in_spec else ("parameters never default to 0",)
         self.fail(Diagnostic("E101", f"unknown {what} `{name.name}`", name.span, help=help_, note=note))
-
-    def _about(self, name: str) -> str:
-        entry = self.entries.get(name)
-        return f"  ({entry.about})" if entry is not None and entry.about else ""
 
 
 def column_value(column: Column) -> Number:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from stlc.compile.frontend.arithmetic import refuse_point
@@ -32,8 +32,13 @@ def reach_of_formula(
     Raises:
         Failed: the range of a signal is unknown, or no predicate varies (E205).
     """
-    known = dict(ranges)
-    found = [reach_of_number(pred.num, known, place, scope) for pred in _predicates(formula, known)]
+    known, found = dict(ranges), []
+    for node in formula.walk():
+        if isinstance(node, typed.Predicate):
+            found.append(reach_of_number(node.num, known, place, scope))
+        elif isinstance(node, typed.Freeze):
+            bound = {name: bounds(num, known) for name, num in node.bindings}
+            known.update({name: ends for name, ends in bound.items() if ends is not None})
     if not found:
         scope.fail(Diagnostic("E205", "this has no predicate that varies", place))
     return max(found)
@@ -58,16 +63,6 @@ def reach_of_number(num: ir.Num, ranges: Mapping[str, Bounds], place: Span, scop
         message += f": {listed} declares no range"
         help_ = (f"signal {missing[0]} in [low, high]", *help_)
     return scope.fail(Diagnostic("E205", message, place, help=help_))
-
-
-def _predicates(formula: typed.Formula, ranges: dict[str, Bounds]) -> Iterator[typed.Predicate]:
-    """Yield the predicates of a formula; the ranges of values bound by `freeze` are added to `ranges`."""
-    for node in formula.walk():
-        if isinstance(node, typed.Predicate):
-            yield node
-        elif isinstance(node, typed.Freeze):
-            found = {name: bounds(num, ranges) for name, num in node.bindings}
-            ranges.update({name: ends for name, ends in found.items() if ends is not None})
 
 
 MARKS = ("safety", "liveness")
@@ -166,7 +161,10 @@ def _with(found: Tags, tag: ast.Tag, scope: Scope) -> Tags:
                 scope.fail(Diagnostic("E501", f"`@{tag.name}` takes no argument", tag.span))
             return replace(found, marks=found.marks | {tag.name})
         case "weight":
-            return replace(found, weight=_positive(tag, scope))
+            weight = _number(tag, scope)
+            if not isinstance(weight, ir.Const):
+                scope.fail(Diagnostic("E205", f"`@{tag.name}` takes a positive constant", tag.args[0].span))
+            return replace(found, weight=weight.value)
         case "scale":
             scale = None if _word(tag) == "auto" else _number(tag, scope)
             return replace(found, scale=scale, scale_span=tag.span)
@@ -179,13 +177,10 @@ def _with(found: Tags, tag: ast.Tag, scope: Scope) -> Tags:
                 scope.fail(Diagnostic("E501", "`@product` takes no argument", tag.span))
             return replace(found, product=True)
         case _:
-            return scope.fail(_unknown(tag))
-
-
-def _unknown(tag: ast.Tag) -> Diagnostic:
-    near = closest(tag.name, _KNOWN)
-    hint = f"did you mean `@{near}`?  " if near is not None else ""
-    return Diagnostic("E501", f"unknown tag `@{tag.name}`", tag.span, help=(f"{hint}tags: {_SHOWN}",))
+            near = closest(tag.name, _KNOWN)
+            hint = f"did you mean `@{near}`?  " if near is not None else ""
+            help_ = (f"{hint}tags: {_SHOWN}",)
+            return scope.fail(Diagnostic("E501", f"unknown tag `@{tag.name}`", tag.span, help=help_))
 
 
 def _only(tag: ast.Tag) -> ast.Expr | None:
@@ -203,13 +198,6 @@ def _text(tag: ast.Tag, scope: Scope) -> str:
     if isinstance(value, ast.String):
         return value.value
     return scope.fail(Diagnostic("E501", f'`@{tag.name}` takes one text: `@{tag.name}("…")`', tag.span))
-
-
-def _positive(tag: ast.Tag, scope: Scope) -> float:
-    num = _number(tag, scope)
-    if not isinstance(num, ir.Const):
-        scope.fail(Diagnostic("E205", f"`@{tag.name}` takes a positive constant", tag.args[0].span))
-    return num.value
 
 
 def _number(tag: ast.Tag, scope: Scope) -> ir.Num:
