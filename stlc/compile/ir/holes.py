@@ -71,7 +71,11 @@ def _unsure(formula: ir.Formula, holes: Names, nans: Names | None, *, least: boo
     """`nans` are the frozen values that may be NaN; None if computed NaN does not count as unknown."""
     match formula:
         case ir.Predicate(num=num):
-            atom, known = _decided(formula, nans, least=least), _known(num, holes)
+            atom, known = formula, _known(num, holes)
+            if nans is not None and _is_partial(num, nans):  # the margin is -inf or inf in place of NaN
+                margin = _with_nan(num, nans)
+                other = ir.Const(-math.inf if least is (atom.sign > 0) else math.inf)
+                atom = replace(atom, num=_is_number(margin).select(margin, other))
             if known is None:
                 return atom
             # outside of the trace the guard equals the predicate: false before a negation if windows are cut
@@ -120,15 +124,6 @@ def _returns_nan(call: ir.Extern) -> bool:
     if not isinstance(body, ir.Body):
         return True
     return any(_is_partial(num, frozenset()) for num in (*(num for _, num in body.lets), *body.outputs))
-
-
-def _decided(atom: ir.Predicate, nans: Names | None, *, least: bool) -> ir.Predicate:
-    """Return the predicate with the margin -inf (`least`) or +inf in place of NaN."""
-    if nans is None or not _is_partial(atom.num, nans):
-        return atom
-    num = _with_nan(atom.num, nans)
-    other = ir.Const(-math.inf if least is (atom.sign > 0) else math.inf)
-    return replace(atom, num=_is_number(num).select(num, other))
 
 
 def _is_number(num: ir.Num) -> ir.Formula:

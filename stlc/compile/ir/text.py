@@ -34,18 +34,14 @@ def show_formula(formula: ir.Formula) -> str:
             return f"freeze {bound} in {_operand(body)}"
         case ir.AtStart(body):
             return f"at the start ({show_formula(body)})"
+        case ir.Windowed():  # as `always[0..3] p` or `p until[0..3] q`
+            *before, last = map(_operand, _parts(formula))
+            window, end = formula.window, "start" if formula.back else "end"
+            op = f"{formula.op}[{window.lo}..{end if window.hi is None else window.hi}]"
+            return " ".join([*before, op, last])
         case _:
-            return _operator(formula)
-
-
-def _operator(formula: Any) -> str:
-    """Return the text of an operator with its window in samples, as `always[0..3] p` or `p until[0..3] q`."""
-    parts = [_operand(part) for part in _parts(formula)]
-    if not isinstance(formula, ir.Windowed):
-        return f" {formula.op} ".join(parts)
-    window, end = formula.window, "start" if formula.back else "end"
-    *before, last = parts
-    return " ".join([*before, f"{formula.op}[{window.lo}..{end if window.hi is None else window.hi}]", last])
+            joined: Any = formula
+            return f" {joined.op} ".join(map(_operand, _parts(formula)))
 
 
 def _operand(formula: ir.Formula) -> str:
