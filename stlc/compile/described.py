@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from stlc.compile.ir.discretize import Horizon
@@ -49,7 +49,13 @@ class RequirementInSteps:
     def of(cls, rule: CompiledRequirement, dt: float) -> RequirementInSteps:
         """A requirement on a grid with the time step `dt` in seconds."""
         reach, tags = Horizon(rule.reach * dt, rule.reach), tuple(sorted(rule.tags))
-        return cls(rule.name, rule.doc, tags, rule.weight, rule.scale, reach, tuple(_intervals(rule, dt)))
+        intervals = []
+        for node in rule.formula.windows():
+            low, high = node.window.lo, node.window.hi
+            seconds = (low * dt, None if high is None else high * dt)
+            written, line = (node.span.text, node.span.line) if node.span else ("", None)
+            intervals.append(WrittenInterval(node.op, (low, high), seconds, written, line))
+        return cls(rule.name, rule.doc, tags, rule.weight, rule.scale, reach, tuple(intervals))
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,12 +93,3 @@ class CompiledSpec:
             tuple(rule.name for rule in compiled.safety),
             tuple(RequirementInSteps.of(rule, dt) for rule in compiled.requirements),
         )
-
-
-def _intervals(rule: CompiledRequirement, dt: float) -> Iterator[WrittenInterval]:
-    """Yield the intervals of the temporal operators in a requirement; `dt` is the time step in seconds."""
-    for node in rule.formula.windows():
-        low, high = node.window.lo, node.window.hi
-        seconds = (low * dt, None if high is None else high * dt)
-        written, line = (node.span.text, node.span.line) if node.span else ("", None)
-        yield WrittenInterval(node.op, (low, high), seconds, written, line)

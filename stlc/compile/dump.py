@@ -67,7 +67,9 @@ def _beside(compiled: Compiled) -> Iterator[str]:
     yield f"    {'written':<{left}}  compiled"
     for (rule, kind), text in zip(_rules(compiled), written, strict=True):
         formula, *added = [_wrapped(became, WIDTH - left - 6, "  ") for became in _became(rule, compiled)]
-        right = [*_cut(formula), *(line for lines in added for line in lines)]
+        if len(formula) > LONG:
+            formula = [*formula[:SHOWN], f"  … {len(formula) - SHOWN} more lines: --show ir"]
+        right = [*formula, *(line for lines in added for line in lines)]
         rows = zip_longest(_wrapped(text, left), right, fillvalue="")
         lines = [_name(rule, kind), *(f"    {one:<{left}}  {other}".rstrip() for one, other in rows)]
         yield "\n".join(lines)
@@ -95,13 +97,6 @@ def _wrapped(text: str, width: int, hanging: str = "") -> list[str]:
     return [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines]
 
 
-def _cut(lines: list[str]) -> list[str]:
-    """Return the lines of a formula; of a long formula, the first lines and a count of the others."""
-    if len(lines) <= LONG:
-        return lines
-    return [*lines[:SHOWN], f"  … {len(lines) - SHOWN} more lines: --show ir"]
-
-
 def _name(rule: CompiledRequirement, kind: str) -> str:
     tags = [f"@{show_name(tag)}" for tag in sorted(rule.tags)]
     if rule.weight != 1:
@@ -122,17 +117,9 @@ def _rule(rule: CompiledRequirement, kind: str, compiled: Compiled, part: Part) 
 
 
 def _instants(rule: CompiledRequirement, grid: Grid) -> list[str]:
-    return list(_times(rule, grid)) or ["the first sample alone"]
-
-
-def _times(rule: CompiledRequirement, grid: Grid) -> Iterator[str]:
-    """Yield a line for each distinct interval of a formula: operator, interval in seconds and in samples."""
-    seen: set[str] = set()
-    for node in rule.formula.windows():
-        line = _interval(node, grid)
-        if line not in seen:
-            seen.add(line)
-            yield line
+    """Return a line for each distinct interval of a formula: operator, interval in seconds and in samples."""
+    lines = dict.fromkeys(_interval(node, grid) for node in rule.formula.windows())
+    return list(lines) or ["the first sample alone"]
 
 
 def _interval(node: ir.Windowed, grid: Grid) -> str:

@@ -15,7 +15,7 @@ No stage needs torch.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Literal, TypeAlias, final
@@ -169,7 +169,15 @@ class Compiled:
         from the first sample, and the requirement is judged only once per trajectory. A requirement without
         absolute operators is unchanged.
         """
-        return tuple(_from_start(rule, self.grid) if rule.absolute else rule for rule in self.requirements)
+        found = []
+        for rule in self.requirements:
+            if rule.absolute:
+                lowered = self.grid.lower(rule.typed.formula.from_first_sample(), [])
+                formula = simplify(lowered)
+                reach = formula.reach.future
+                rule = replace(rule, formula=formula, lowered=lowered, reach=reach, windowed=False)
+            found.append(rule)
+        return tuple(found)
 
 
 def compile_spec(
@@ -209,9 +217,11 @@ def resolve_for(
         SpecError: all errors that the stage finds.
     """
     overrides = overrides or {}
-    if interface is not None and purpose == "check":
+    if interface is not None and purpose == "check":  # a state that is given becomes a parameter
         given = {item.name for item in spec.parameters} & overrides.keys()
-        interface = _without(interface, given)
+        columns = interface.signature.columns
+        kept = tuple(column for column in columns if column.name.partition("[")[0] not in given)
+        interface = replace(interface, signature=Signature(kept))
     return resolve(spec, interface=interface, overrides=overrides)
 
 
@@ -244,17 +254,21 @@ def compile_resolved(
         ]
     if errors:
         raise SpecError(*errors)
+    timers = stage.table.timers
+    read = frozenset().union(*(rule.formula.columns for rule in (*requirements, *assumptions)))
+    signature = Signature(tuple(column for column in spec.signature.columns if column.name in read))
+    counted = (int(timer.high) for timer in timers if timer.kind == "timer")  # greatest numbers of steps
     return Compiled(
         name=spec.name,
         spec=spec.source_ast,
-        signature=_signature(spec, (*requirements, *assumptions), stage.table.timers),
+        signature=signature.extended(*(timer.column for timer in timers)),
         requirements=requirements,
         assumptions=assumptions,
-        timers=stage.table.timers,
+        timers=timers,
         parameters=tuple(each for each in spec.parameters if not each.carried),
         guidance_cost=guidance_cost(goals),
         mission=max(map(mission_steps, goals), default=None),
-        recurring=_remembered(stage.table.timers) if any(map(never_over, goals)) else None,
+        recurring=max(counted, default=0) if any(map(never_over, goals)) else None,
         grid=grid,
         warnings=tuple(not_allowed(sink)),
         typed=spec,
@@ -300,7 +314,10 @@ class _Stage:
         requirement = replace(requirement, formula=written)
         if self.purpose == "train":
             self.sink.extend(jumps(written, self.ranges))
-        rewritten = self._rewritten(requirement, recurs=recurs)
+            rewritten = augment(requirement, self.grid, self.table, self.sink, recurs=recurs)
+        else:  # a recorded trace begins with the mission: absolute intervals count from its first sample
+            judged = written.from_first_sample() if written.absolute else written
+            rewritten = Augmented(judged, typed.Truth(written.span, True), None)
         if rewritten.goal is not None:
             self.goals.append(rewritten.goal)
         lowered = self.grid.lower(rewritten.formula, self.sink)
@@ -321,42 +338,6 @@ class _Stage:
             span=requirement.span,
             typed=requirement,
         )
-
-    def _rewritten(self, requirement: typed.Requirement, *, recurs: bool) -> Augmented:
-        """Rewrite absolute operators and, for training, past operators of a requirement.
-
-        For training, formulas over added states replace them. A recorded trace begins with the mission, so
-        the interval of an absolute operator counts from its first sample.
-        """
-        if self.purpose == "train":
-            return augment(requirement, self.grid, self.table, self.sink, recurs=recurs)
-        written = requirement.formula
-        formula = written.from_first_sample() if written.absolute else written
-        return Augmented(formula, typed.Truth(written.span, True), None)
-
-
-def _from_start(rule: CompiledRequirement, grid: Grid) -> CompiledRequirement:
-    lowered = grid.lower(rule.typed.formula.from_first_sample(), [])
-    formula = simplify(lowered)
-    return replace(rule, formula=formula, lowered=lowered, reach=formula.reach.future, windowed=False)
-
-
-def _remembered(timers: Iterable[Timer]) -> int:
-    """Return the greatest number of steps that one of the timers counts; 0 without timers."""
-    return max((int(timer.high) for timer in timers if timer.kind == "timer"), default=0)
-
-
-def _without(interface: Interface, names: Iterable[str]) -> Interface:
-    """Return the interface without the states in `names`, which become parameters of the specification."""
-    kept = [column for column in interface.signature.columns if column.name.partition("[")[0] not in names]
-    return replace(interface, signature=Signature(tuple(kept)))
-
-
-def _signature(spec: typed.Spec, rules: Iterable[CompiledRequirement], timers: Iterable[Timer]) -> Signature:
-    """Return the signature: signals that requirements read, then the added states."""
-    read = frozenset().union(*(rule.formula.columns for rule in rules))
-    kept = Signature(tuple(column for column in spec.signature.columns if column.name in read))
-    return kept.extended(*(timer.column for timer in timers))
 
 
 def _leaves_plan(rule: CompiledRequirement, grid: Grid) -> bool:
