@@ -25,7 +25,7 @@ from stlc.provenance import sha256
 
 if TYPE_CHECKING:
     from stlc.assurance.model_simulator import ModelSimulator
-    from stlc.assurance.plant_judge import JudgedRun, PlantJudge
+    from stlc.assurance.plant_judge import PlantJudge
     from stlc.compile.pipeline import CompiledRequirement
     from stlc.plants.plant import PlantFinding
 
@@ -83,7 +83,12 @@ class PlantDraws:
         for run in self.judge.runs(points, seeds, jobs=self.jobs, stream=self.judge.long):
             if run.finding is not None:
                 self.findings.append(run.finding)
-            sample = _sample(rules, [_judged(run, rule) for rule in rules])
+            if run.verdict is not None:
+                judged = [Judged.by(run.verdict[rule.name]) for rule in rules]
+            else:  # without a trace, it violates all
+                no, yes, worst = np.array([False]), np.array([True]), np.array([-np.inf])
+                judged = [Judged(rule.name, rule.unit, no, yes, worst) for rule in rules]
+            sample = _sample(rules, judged)
             yield sample.in_scope(np.array([run.verdict is None or run.verdict.in_scope > 0]))
 
     def record(self, seeds: Sequence[int]) -> CertifiedDraws:
@@ -146,7 +151,8 @@ class ModelDraws:
         states = [task.system.sample(1, seed=seed, dtype=torch.float64) for seed in seeds]
         columns = self.simulator.columns_of(task, torch.cat(states))
         scope = in_scope(task, columns)
-        margins = np.stack([np.broadcast_to(each[0], len(seeds)) for each in self._evaluated(rules, columns)])
+        found: Sequence[Any] = evaluate([rule.formula for rule in rules], columns)
+        margins = np.stack([np.broadcast_to(each[0], len(seeds)) for each in found])
         finite = np.isfinite(np.stack([column[-1] for column in columns.values()])).all(0)
         margins = np.where(finite & ~np.isnan(margins), margins, -np.inf)
         judged = [
@@ -154,10 +160,6 @@ class ModelDraws:
             for rule, row in zip(rules, margins, strict=True)
         ]
         yield _sample(rules, judged).in_scope(scope)
-
-    @staticmethod
-    def _evaluated(rules: Sequence[CompiledRequirement], columns: Mapping[str, Any]) -> Sequence[Any]:
-        return evaluate([rule.formula for rule in rules], columns)
 
     def record(self, seeds: Sequence[int]) -> CertifiedDraws:
         """Record of the system in the certificate, its files, and the conditions."""
@@ -221,14 +223,6 @@ def _sample(rules: Sequence[CompiledRequirement], judged: Sequence[Judged]) -> S
     weights = {rule.name: rule.factor for rule in rules}
     units = np.arange(len(judged[0].satisfied))
     return Sample(together(judged, weights), tuple(judged), units, "simulation")
-
-
-def _judged(run: JudgedRun, rule: CompiledRequirement) -> Judged:
-    """Verdict on one simulation under one requirement; one without a trace violates it."""
-    if run.verdict is not None:
-        return Judged.by(run.verdict[rule.name])
-    no, yes = np.zeros(1, dtype=np.bool_), np.ones(1, dtype=np.bool_)
-    return Judged(rule.name, rule.unit, no, yes, np.array([-np.inf]))
 
 
 # ---------------------------------------------------------------------- verification

@@ -180,7 +180,7 @@ def inputs_of(folder: RunDir, decl: SystemDecl, rules: Rules | None, guard: str)
         functions=sha256("\0".join(f"{name} {sha256(path.read_bytes())}" for name, path in files)),
         rules=None if rules is None else sha256(f"{judge} {changes}"),
         world=None if decl.test.world is None else sha256(decl.test.world.path.read_bytes()),
-        policy=_policy(folder),
+        policy=sha256("\0".join(map(sha256, (folder.read(RunDir.CONFIG), *newest_tensors(folder))))),
         guard_version=GUARDS.get(guard).version,
     )
 
@@ -199,9 +199,3 @@ def verify(stored: StoredCertificate, folder: RunDir) -> CertificateVerification
     decl = Run.declaration_in(folder, conditions.overrides, conditions.scenario)
     present: Any = plain(inputs_of(folder, decl, Rules.stored(folder, decl), conditions.guard))
     return compared(stored, present)
-
-
-def _policy(folder: RunDir) -> str:
-    """Hash of the tensors of the newest checkpoint, if there is one, and of the resolved options."""
-    parts = [folder.read(RunDir.CONFIG), *newest_tensors(folder)]
-    return sha256(b"\0".join(sha256(part).encode() for part in parts))

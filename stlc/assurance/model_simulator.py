@@ -21,7 +21,6 @@ from stlc.controller.problem.task import Task
 from stlc.controller.search.plan_traces import trace_of
 from stlc.controller.search.planner import PlanResult
 from stlc.diagnostics import usage
-from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.quantiles import InitialPoints
 from stlc.monitor.instants import rule_bounds
 from stlc.monitor.values import Record
@@ -68,7 +67,10 @@ class ModelSimulator:
 
         @cache
         def finer(sampled: bool) -> Task:
-            return Task.load(spec, system, {**overrides, **_halved(decl, sampled=sampled)})
+            halved = {"time.dt": f"{decl.dt / 2} s", "time.horizon": f"{2 * decl.horizon} steps"}
+            if sampled:  # what is computed or counted at samples keeps its period: a shorter step within it
+                halved = {"time.substeps": str(2 * decl.substeps)}
+            return Task.load(spec, system, {**overrides, **halved})
 
         return cls(task, None if decl.discrete else lambda counts: finer(digital or counts))
 
@@ -219,17 +221,6 @@ class ModelSimulator:
 def _duration(task: Task) -> float:
     """Duration of the longest input signal in seconds; infinite if there are none."""
     return max((float(each.duration) for each in task.system.decl.inputs), default=np.inf)
-
-
-def _halved(decl: SystemDecl, *, sampled: bool) -> dict[str, str]:
-    """Keys of a system file that halve its time step: name -> text.
-
-    Only the step of the integration is halved if values are computed at samples (`sampled`), as by a digital
-    controller, or counted by a requirement: they keep their period.
-    """
-    if sampled:
-        return {"time.substeps": str(2 * decl.substeps)}
-    return {"time.dt": f"{decl.dt / 2} s", "time.horizon": f"{2 * decl.horizon} steps"}
 
 
 def in_scope(task: Task, columns: Columns) -> NDArray[np.bool_]:

@@ -240,20 +240,16 @@ def _picked(space: SearchSpace, generator: np.random.Generator, point: Point) ->
         if block is None or kind < 0.25:
             yield [pick]
         elif kind < 0.75:
-            yield _piece(point, block.values, block.values.index(pick))
+            values, last = block.values, len(block.values) - 1
+            first = end = values.index(pick)
+            while first > 0 and point[values[first - 1]] == point[pick]:
+                first -= 1
+            while end < last and point[values[end + 1]] == point[pick]:
+                end += 1
+            yield list(values[first : end + 1])
         else:
             first, last = np.sort(generator.integers(0, len(block.values), 2))
             yield list(block.values[first : last + 1])
-
-
-def _piece(point: Point, values: Sequence[int], index: int) -> list[int]:
-    """Coordinates of the neighbours in `values` that share the value at `index`."""
-    first = last = index
-    while first > 0 and point[values[first - 1]] == point[values[index]]:
-        first -= 1
-    while last + 1 < len(values) and point[values[last + 1]] == point[values[index]]:
-        last += 1
-    return list(values[first : last + 1])
 
 
 class Perturbation(LocalSearch):

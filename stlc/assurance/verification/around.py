@@ -129,7 +129,12 @@ def narrowed(
                     proved.append(known)
                     continue
                 effects = known
-            active[i] = _halved(box, states[i], effects, axes, others)
+            for axis in np.argsort(-effects)[:axes]:
+                low, high = box.split(int(axis))
+                box, other = (high, low) if states[i, axis] >= box.centre[axis] else (low, high)
+                if others is not None:
+                    others(other)
+            active[i] = box
             left.append(i)
         if not left:
             return proved
@@ -138,13 +143,3 @@ def narrowed(
         for box in active:
             others(box)
     return proved
-
-
-def _halved(box: Box, state: Floats, effects: Floats, axes: int, others: Callable[[Box], None] | None) -> Box:
-    """The part of a box around a state, half as wide in the `axes` coordinates with the greatest effects."""
-    for axis in np.argsort(-effects)[:axes]:
-        low, high = box.split(int(axis))
-        box, other = (high, low) if state[axis] >= box.centre[axis] else (low, high)
-        if others is not None:
-            others(other)
-    return box

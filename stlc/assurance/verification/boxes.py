@@ -245,10 +245,16 @@ def _outcomes(assign: Assign, taken: int) -> list[_Outcome]:
     num = extract(assign.value)
     found = []
     for outcome in product(*drawn):
-        table = {f"?{i}": option for i, (_, option) in enumerate(outcome)}
+        options = [option for _, option in outcome]
         chance = float(np.prod([share for share, _ in outcome]))
-        label = "" if not drawn else _label(assign.name, num, [option for _, option in outcome])
+        label = ""
+        if num == ir.Signal("?0") and options[0] in (ir.Const(0.0), ir.Const(1.0)):
+            label = f", {assign.name}" if options[0] == ir.Const(1.0) else f", not {assign.name}"
+        elif drawn:
+            shown = (f"{each.value:g}" if isinstance(each, ir.Const) else "a number" for each in options)
+            label = f", {assign.name}: {' '.join(shown)}"
         if chance > 0.0:
+            table = {f"?{i}": option for i, option in enumerate(options)}
             found.append(_Outcome(label, chance, num.substitute(table), tuple(axes)))
     return found
 
@@ -267,10 +273,3 @@ def _options(num: ir.Num, name: str) -> list[tuple[float, ir.Num]] | None:
             raise Unsupported(f"`{sampler}` in `{name}` has no coordinate from 0 to 1")
         case _:
             return None
-
-
-def _label(name: str, num: ir.Num, values: Sequence[ir.Num]) -> str:
-    if num == ir.Signal("?0") and values[0] in (ir.Const(0.0), ir.Const(1.0)):
-        return f", {name}" if values[0] == ir.Const(1.0) else f", not {name}"
-    shown = [f"{value.value:g}" if isinstance(value, ir.Const) else "a number" for value in values]
-    return f", {name}: {' '.join(shown)}"

@@ -120,7 +120,11 @@ class NetworkLoop(VerificationSubject):
         symbols = count
         for step in range(self._task.horizon):
             if step % self._period == 0:
-                env = self._lighter(env, count)
+                moved = [env[name] for name in self._moved]
+                if (used := in_use(moved)) > count + _KEPT:
+                    # What is left out becomes one symbol for each state that moves.
+                    states = own_symbols(reduced(joined(moved, used), count, _KEPT), 0.0)
+                    env = {**env, **dict(zip(self._moved, columns(states), strict=True))}
                 inputs = own_symbols(joined(self._seen(env, len(index)), in_use(env.values())))
                 first = len(inputs.generators)
                 outputs = own_symbols(reduced(self._bounds.outputs(inputs), first, 0), 0.0)
@@ -149,12 +153,3 @@ class NetworkLoop(VerificationSubject):
                 later[name] = form.with_symbol(symbols) if (form.rest > _LARGE).any() else form
                 symbols = max(symbols, len(later[name].generators))
         return later, symbols
-
-    def _lighter(self, env: Mapping[str, Forms], count: int) -> dict[str, Forms]:
-        """The states with fewer symbols; what is left out is one symbol for each state that moves."""
-        moved = [env[name] for name in self._moved]
-        symbols = in_use(moved)
-        if symbols <= count + _KEPT:
-            return dict(env)
-        states = own_symbols(reduced(joined(moved, symbols), count, _KEPT), 0.0)
-        return {**env, **dict(zip(self._moved, columns(states), strict=True))}

@@ -200,20 +200,14 @@ class PlanBounds:
         raw = reduced(self._network.outputs(self._inputs(observed, symbols), rows), symbols, _KEPT)
         first = len(raw.generators)
         outputs = [each.with_symbol(first + i) for i, each in enumerate(columns(raw))]
-        return [
-            self._squashed(outputs[at * self._width : (at + 1) * self._width])
-            for step in range(self._steps)
-            for at in (min(begun + step, self._steps - 1),)
-        ]
-
-    def _squashed(self, raw: Sequence[Forms]) -> list[Forms]:
-        """Controls of one step in physical units."""
         half, middle = 0.5 * (self._high - self._low), 0.5 * (self._high + self._low)
-        error = (
-            16.0 * UNIT * (np.abs(middle) + half)
-        )  # functions within 4 units of the last place, and the map
-        found = shares(raw, self._controls, FORMS)
-        return [share.times(half[i]).widened(middle[i], error[i]) for i, share in enumerate(found)]
+        error = 16.0 * UNIT * (np.abs(middle) + half)  # functions within 4 units of the last place; the map
+        plan = []
+        for step in range(self._steps):
+            at = self._width * min(begun + step, self._steps - 1)
+            found = shares(outputs[at : at + self._width], self._controls, FORMS)
+            plan.append([each.times(half[i]).widened(middle[i], error[i]) for i, each in enumerate(found)])
+        return plan
 
     def _inputs(self, observed: Sequence[Forms], symbols: int) -> Forms:
         x = joined(observed, symbols)

@@ -102,7 +102,11 @@ class TubeModel:
                 listed = ", ".join(f"`{name}`" for name in sorted(names))
                 message = f"the measurement noise on `{noise.name}` depends on {listed}"
                 raise usage(f"{message}, which is not known exactly", "a tube needs noise with known bounds")
-        _refuse_functions(self._truth, task)
+        for each in (*self._truth.numbers.values(), *(rule.formula for rule in task.rules)):
+            for call in each.calls():
+                if call.opaque:
+                    unbounded = f"`{call.name}` is a Python function, whose values have no bounds"
+                    raise usage(f"{unbounded}: there is no tube")
         self._scale = 1.0 if decl.discrete else system.dt
         self._clock = 0.0, (decl.test.steps + decl.horizon) * system.dt
         self._judge = Judge([rule.formula for rule in task.rules], end=task.graph.end, shifts=False)
@@ -331,16 +335,6 @@ class _Motion:
         return {**env, **{name: spread(form, symbols.batch) for name, form in later}}
 
 
-def _refuse_functions(motion: _Motion, task: Task) -> None:
-    """Refuse Python functions, whose values have no bounds. Raises UsageError (U101)."""
-    for each in (*motion.numbers.values(), *(rule.formula for rule in task.rules)):
-        for call in each.calls():
-            if call.opaque:
-                raise usage(
-                    f"`{call.name}` is a Python function, whose values have no bounds: there is no tube"
-                )
-
-
 def tube(task: Task, x: Any, plans: Any, *, deviations: float = DEVIATIONS) -> Tube:
     """Bounds on the states and on the robustness of plans, for all errors of the task's scenario.
 
@@ -365,14 +359,12 @@ def tube(task: Task, x: Any, plans: Any, *, deviations: float = DEVIATIONS) -> T
         shape = f"(B, {len(task.system.names)}) and (B, {wanted[1]}, {wanted[2]})"
         raise usage(f"states {tuple(states.shape)} and plans {tuple(given.shape)} are not {shape}")
     model = TubeModel(task, deviations=deviations)
-    found = model.tube(states, given)
-    return found if not model.started else _either(found, model.tube(states, given, start=model.started))
-
-
-def _either(one: Tube, other: Tube) -> Tube:
-    """The least tube that contains two others."""
-    states = {
+    one = model.tube(states, given)
+    if not model.started:
+        return one
+    other = model.tube(states, given, start=model.started)
+    hulls = {
         name: Intervals(np.minimum(box.low, also.low), np.maximum(box.high, also.high))
         for (name, box), also in zip(one.states.items(), other.states.values(), strict=True)
     }
-    return Tube(states, torch.minimum(one.low, other.low), torch.maximum(one.high, other.high))
+    return Tube(hulls, torch.minimum(one.low, other.low), torch.maximum(one.high, other.high))
