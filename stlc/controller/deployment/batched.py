@@ -6,7 +6,7 @@ An error in a world's code is reported with its location in the world's file.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -202,7 +202,11 @@ class Worlds:
         with self.drawing():
             acted = self.disturbance.acted(self.system.commanded(x, action).clone())
         acts = torch.split(self.system.planned(x, acted), self.parts)
-        alone = self._alone(before, acts)
+        if all(truth is self.truths[0] for truth in self.truths):
+            alone = self.truths[0].step(torch.cat(before), torch.cat(acts))
+        else:
+            rows = zip(self.truths, before, acts, strict=True)
+            alone = torch.cat([truth.step(state, act) for truth, state, act in rows])
         for row, (world, state, act) in enumerate(zip(self.worlds, before, acts, strict=True)):
             with blamed(world, "advance", f"take step {step}"), self.drawing(row):
                 given.append(world.advance(state, act))
@@ -211,17 +215,6 @@ class Worlds:
         with self.drawing():
             moved = self.disturbance.pushed(reached, known, step)
         return torch.cat((moved, self.system.added_later(x)), 1)
-
-    def _alone(self, before: Sequence[Tensor], acts: Sequence[Tensor]) -> Tensor:
-        """Next states by the true dynamics alone, without the worlds, (rows, n).
-
-        `before`, `acts`: states and actions of each seed. Seeds with the same dynamics are stepped at once.
-        """
-        first = self.truths[0]
-        if all(each is first for each in self.truths):
-            return first.step(torch.cat(tuple(before)), torch.cat(tuple(acts)))
-        each = zip(self.truths, before, acts, strict=True)
-        return torch.cat([truth.step(state, act) for truth, state, act in each])
 
     def options(self, x: Tensor) -> Tensor | None:
         """Return the states that the agents would have under each option.

@@ -7,7 +7,7 @@ last sample. The rules may use past operators, and may refer to the world.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -272,7 +272,19 @@ def runs_by_rules(rules: Rules, task: Task, recording: DeploymentRecording) -> R
     found = {judgement.name: np.array(judgement.statuses) for judgement in verdict}
     safety = frozenset(rule.name for rule in verdict.subject.compiled.safety)
     kept = tuple(name for name in found if name in safety)
-    return RunVerdicts(found, tuple(_broken(verdict, found)), np.ones(verdict.traces, dtype=bool), kept)
+    broken, left = [], MOST_TIMED
+    for row in range(verdict.traces):
+        names = [name for name, statuses in found.items() if statuses[row] == "violated"]
+        if not names:
+            continue
+        times: dict[str, float | None] = dict.fromkeys(names)
+        if left > 0:
+            run = verdict.within(np.arange(verdict.traces) == row)
+            causes = {name: explain(run, name) for name in names}
+            times |= {name: cause.shown_time for name, cause in causes.items() if cause is not None}
+        broken.append(Broken(row, times))
+        left -= len(names)
+    return RunVerdicts(found, tuple(broken), np.ones(verdict.traces, dtype=bool), kept)
 
 
 def judge_runs_by_plans(executed: Executed, dt: float) -> RunVerdicts:
@@ -302,26 +314,6 @@ def judge_runs_by_plans(executed: Executed, dt: float) -> RunVerdicts:
         if each
     )
     return RunVerdicts(rules, tuple(broken), viable | obeying(rules, len(viable)), executed.safety)
-
-
-def _broken(verdict: Verdict, rules: Mapping[str, NDArray[np.str_]]) -> Iterator[Broken]:
-    left = MOST_TIMED
-    for row in range(verdict.traces):
-        names = [name for name, statuses in rules.items() if statuses[row] == "violated"]
-        if names:
-            yield Broken(row, _moments(verdict, row, names) if left > 0 else dict.fromkeys(names))
-            left -= len(names)
-
-
-def _moments(verdict: Verdict, row: int, names: Sequence[str]) -> dict[str, float | None]:
-    """Times at which the run `row` broke the rules in `names`: rule -> time in seconds.
-
-    The time is None if no single instant decides.
-    """
-    alone = np.zeros(verdict.traces, dtype=bool)
-    alone[row] = True
-    causes = {name: explain(verdict.within(alone), name) for name in names}
-    return {name: None if cause is None else cause.shown_time for name, cause in causes.items()}
 
 
 # ------------------------------------------------------------------------- JSON

@@ -123,9 +123,11 @@ class LocalExecutor:
         """Run one job to its end on free cores, and return its result."""
         share = self.shares.get()
         try:
-            process = self._start(job, share)
-            if process is None:
-                return JobResult(job, -signal.SIGINT, None, "", len(share))
+            with self.lock:
+                if self.stopped:
+                    return JobResult(job, -signal.SIGINT, None, "", len(share))
+                process = start(job.arguments, share if self.workers > 1 else None)
+                self.live.add(process)
             started(job)
             outputs = process.communicate()
             with self.lock:
@@ -133,15 +135,6 @@ class LocalExecutor:
         finally:
             self.shares.put(share)
         return JobResult.of(job, process.returncode, outputs, share)
-
-    def _start(self, job: Job, share: frozenset[int]) -> subprocess.Popen[str] | None:
-        """Start the job's process on the cores `share`; return None if the executor was stopped."""
-        with self.lock:
-            if self.stopped:
-                return None
-            process = start(job.arguments, share if self.workers > 1 else None)
-            self.live.add(process)
-        return process
 
     def stop(self) -> None:
         """Ask all processes to save and stop, and wait for them; an interrupt meanwhile kills them."""

@@ -132,7 +132,10 @@ class GradientAscent:
         `x`: states, (agents, n). `rate`: initial step size. `until`: deadline.
 
         Returns:
-            The best plans, (agents, KEPT, T, m), and their values (see `_worth`), (agents, KEPT), best first.
+            The best plans, (agents, KEPT, T, m), and their values, (agents, KEPT), best first. If a plan
+            satisfies the specification, its value is its robustness plus the large number `APART`. If it is
+            only safe, it is the robustness alone. If it is unsafe, it is the robustness of the safety
+            requirements minus `APART`.
         """
         agents, count = plans.shape[:2]
         starts, rows = np.repeat(x, count, 0), plans.reshape(-1, *plans.shape[2:])
@@ -141,7 +144,10 @@ class GradientAscent:
         solved = np.zeros(agents, dtype=bool)
         for step in range(STEPS + 1):
             each, pull = self._judged(starts, rows)
-            now = self._worth(each)
+            rho = each.min(1)
+            safe = each[:, self._safe].min(1) if self._safe else np.full_like(rho, np.inf)
+            below = np.where(TOLERANCE.satisfied(safe), rho, safe - APART)
+            now = np.where(TOLERANCE.satisfied(rho), APART + rho, below)
             better = (now > value) & ~np.repeat(solved, count)
             value[better], best[better] = now[better], rows[better]
             solved = value.reshape(agents, count).max(1) >= APART + self.target
@@ -160,21 +166,6 @@ class GradientAscent:
         order = np.argsort(-value.reshape(agents, count), axis=1, kind="stable")[:, :KEPT]
         rows = order + count * np.arange(agents)[:, None]
         return best[rows], value[rows]
-
-    def _worth(self, each: Numbers) -> Numbers:
-        """Values by which plans are compared: (rows, R) -> (rows,); larger is better.
-
-        `each`: robustness of the plans per requirement, (rows, R).
-
-        If a plan satisfies the specification, the value is its robustness plus the large number `APART`. If
-        the plan is only safe, it is the robustness alone. If the plan is unsafe, it is the robustness of the
-        safety requirements minus `APART`.
-        """
-        rho = each.min(1)
-        safe = each[:, self._safe].min(1) if self._safe else np.full_like(rho, np.inf)
-        below = np.where(TOLERANCE.satisfied(safe), rho, safe - APART)
-        value: Numbers = np.where(TOLERANCE.satisfied(rho), APART + rho, below)
-        return value
 
     def _judged(self, x: Numbers, u: Numbers) -> tuple[Numbers, Pull]:
         """Compute the robustness of plans per requirement, and a function that returns gradients.

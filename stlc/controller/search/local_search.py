@@ -328,20 +328,14 @@ class _TorchSearch:
         shift = start + size * self._stretch(shape) * self._randn(*shape[:2], 1, shape[3])
         level = self.low + span * self._rand(*shape[:2], 1, shape[3])
         held = torch.where(self._stretch(shape) > 0, level, start)
-        others = self._others(plans, tries - 3 * quarter, library)
-        return torch.cat((noise, shift, held, others), 1).clamp(self.low, self.high)
-
-    def _others(self, plans: Tensor, count: int, library: Tensor) -> Tensor:
-        """Draw random plans for the B states of `plans`: (B, count, T, m).
-
-        They are taken from `library`, or are piecewise constant if the library holds few plans.
-        """
-        states, steps, controls = plans.shape
+        count, (states, steps, controls) = tries - 3 * quarter, plans.shape
         if library.shape[0] >= 64:
-            return library[self._randint(0, library.shape[0], states, count)]
-        pieces = 4
-        levels = self.low + (self.high - self.low) * self._rand(states, count, pieces, controls)
-        return levels.repeat_interleave(-(-steps // pieces), 2)[:, :, :steps]
+            others = library[self._randint(0, library.shape[0], states, count)]
+        else:
+            pieces = 4
+            level = self.low + span * self._rand(states, count, pieces, controls)
+            others = level.repeat_interleave(-(-steps // pieces), 2)[:, :, :steps]
+        return torch.cat((noise, shift, held, others), 1).clamp(self.low, self.high)
 
     def _stretch(self, shape: tuple[int, ...]) -> Tensor:
         """Draw random intervals of time: (B, tries, T, m), 1 inside an interval and 0 outside.

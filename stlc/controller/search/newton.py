@@ -192,7 +192,11 @@ class GaussNewton:
         curve = np.einsum("bcki,bckj,bck->kbij", rows, rows, weight, optimize=True)
         pull = -np.einsum("bcki,bck->kbi", rows, weight * rest)
         by_state, by_control = self._jacobians(now)
-        effect = _mean_effect(by_state, by_control, curve) / np.maximum(1, near.sum((1, 2)))
+        effects = by_control @ by_control.swapaxes(2, 3)  # of all controls before a sample, squared
+        for k in range(1, len(effects)):
+            effects[k] += by_state[k] @ effects[k - 1] @ by_state[k].swapaxes(1, 2)
+        effect = np.nan_to_num(np.einsum("kbij,kbij->b", effects, curve[1:]), nan=1.0, posinf=1e12)
+        effect = effect / np.maximum(1, near.sum((1, 2)))
         weight = barrier_weight(now.cost(needed, margin), now.shares)[:, None, None]
         below, above = now.shares, 1.0 - now.shares
         own = weight / below**2 + weight / above**2 + (effect * damping + TINY**2)[:, None, None]
@@ -302,16 +306,6 @@ def barrier_weight(cost: Numbers, shares: Numbers) -> Numbers:
     """Weight of the barrier of plans, (B, T, m), by their cost, (B,): it falls with the cost."""
     found: Numbers = (BARRIER / max(1, shares[0].size) * cost).clip(TINY, 0.1)
     return found
-
-
-def _mean_effect(by_state: Numbers, by_control: Numbers, curve: Numbers) -> Numbers:
-    """Sum over the conditions of the squared effect that the controls before them have on them, (B,)."""
-    effects = by_control @ by_control.swapaxes(2, 3)
-    turned = by_state.swapaxes(2, 3)
-    for k in range(1, len(effects)):
-        effects[k] += by_state[k] @ effects[k - 1] @ turned[k]
-    found: Numbers = np.einsum("kbij,kbij->b", effects, curve[1:])
-    return np.nan_to_num(found, nan=1.0, posinf=1e12)
 
 
 def riccati(

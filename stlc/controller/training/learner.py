@@ -114,7 +114,10 @@ class Trainer(Learner):
         super().__init__(task, config, steps=steps, device=device, ranks=ranks)
         self.method: NetworkMethod = METHODS.get(config.method)
         self.network = self._network()
-        self.supply = self._supply()
+        self.supply: Supply = Draws(task, self.generator, self.device)
+        if task.compiled.timers:  # states that simulated missions visit
+            policy = BestOfKPolicy(task, self.network)
+            self.supply = Missions(task, self.generator, self.device, lambda x0: policy.plan_judged(x0)[1])
         self.average = self._network()
         self.network.normalise(self.supply.take(4096))
         ranks.agree_on(self.network)
@@ -458,16 +461,6 @@ class Trainer(Learner):
 
     def _searcher(self, target: float) -> Searcher:
         return Searcher(self.task, self.generator, target=target, device=self.device)
-
-    def _supply(self) -> Supply:
-        """Make the source of training states.
-
-        If the specification adds timers, these are states that simulated missions visit, else random states.
-        """
-        if not self.task.compiled.timers:
-            return Draws(self.task, self.generator, self.device)
-        policy = BestOfKPolicy(self.task, self.network)
-        return Missions(self.task, self.generator, self.device, lambda x0: policy.plan_judged(x0)[1])
 
     def _network(self) -> PlanNetwork:
         """Make a network whose initial weights depend only on `config.seed`."""

@@ -450,7 +450,11 @@ class _Session:
     def _trained(self) -> bool:
         """Make all steps; return False if the training has to stop before the last one."""
         learner, saved = self.learner, time.perf_counter()
-        while (more := self._goes_on()) and not self._hopeless():
+        while more := self._goes_on():
+            patience = max(BARREN_VALIDATIONS * learner.config.every, BARREN_SHARE * learner.steps)
+            useless = bool(self.refuted) or (self.exhausted and learner.step >= patience)
+            if self.barren and learner.searches and useless:  # no satisfying plan was ever found
+                break
             if not math.isfinite(learner.advance()):
                 raise self._broken()
             began = self.now()
@@ -482,8 +486,13 @@ class _Session:
         """
         learner = self.learner
         ends = self._planned() <= learner.step
-        if (ends or learner.step >= learner.next_validation) and not self._wait_for_search():
-            return None
+        if ends or learner.step >= learner.next_validation:
+            began = self.now()
+            came = learner.wait(self.watch.stop)
+            if learner.searches:
+                self.pace.searched(learner.step, self.now() - began)
+            if learner.ranks.any(not came):
+                return None
         if ends and self._planned() <= learner.step:
             return False
         if learner.step >= learner.next_validation:
@@ -572,26 +581,6 @@ class _Session:
         self.pace.irregular(self.now() - began)
         self.writer.note({"falsification": known.summary()})
         return True
-
-    def _wait_for_search(self) -> bool:
-        """Wait for the concurrent search; return False if the user ends the training during the wait."""
-        began = self.now()
-        came = self.learner.wait(self.watch.stop)
-        if self.learner.searches:
-            self.pace.searched(self.learner.step, self.now() - began)
-        return not self.learner.ranks.any(not came)
-
-    def _hopeless(self) -> bool:
-        """True if no satisfying plan was ever found, and further search is useless.
-
-        Search is useless in two cases: bounds prove that no plan exists; or enough steps have been made, and
-        the longest search has found none.
-        """
-        learner = self.learner
-        patience = max(BARREN_VALIDATIONS * learner.config.every, BARREN_SHARE * learner.steps)
-        if not self.barren or not learner.searches:
-            return False
-        return bool(self.refuted) or (self.exhausted and learner.step >= patience)
 
     def _unjudged(self, *, interrupted: bool) -> TrainingOutcome:
         """Outcome of a training run that ended before its evaluation.

@@ -218,7 +218,12 @@ class Phases:
         `effort` is a factor of the generations of local searches.
         """
         row, middle = self._row(state, request), np.broadcast_to(self._middle, self._constant[0].shape)
-        plans, rho = self._remembered(row, request, middle)
+        # Initial plans: the middle of the ranges, what reached the target before, the best for other targets.
+        own = self._known[request.target]
+        plans, first = np.stack((middle, *own, *chain(*self._known))), 1 + len(own)
+        rho = self._judged(np.repeat(row, len(plans), 0), plans)
+        kept = [*range(first), *(first + (-rho[first:]).argsort(kind="stable")[:KEPT])]
+        plans, rho = plans[kept], rho[kept]
         for _ in range(min(ROUNDS[0] + effort - 1, ROUNDS[1])):
             if rho.max() < 0.0:
                 plans, rho = self._improved(row, request, plans, random, effort)
@@ -245,31 +250,14 @@ class Phases:
             else:
                 found = self._phase(row, plans[int(rho.argmax())])
         if found.margin >= -UNSURE:
-            found = self._calm(state, request, found)
+            row, plan = self._row(state, replace(request, last=found.sample)), found.plan
+            for control, level in enumerate(self._middle):  # it is held there unless it is needed
+                calmer = np.where(np.arange(len(self._middle)) == control, level, plan)
+                if self._judged(row, calmer[None])[0] >= found.margin:
+                    plan = calmer
+            found = found if plan is found.plan else self._phase(row, plan)
             self._known[request.target].append(found.plan)
         return found
-
-    def _remembered(self, row: Numbers, request: PhaseRequest, middle: Numbers) -> tuple[Numbers, Numbers]:
-        """Return initial plans, (k, L, m), with their robustness.
-
-        They are the middle of the ranges of the controls, what reached the target before, and the best of
-        what reached other targets.
-        """
-        own, others = self._known[request.target], [*chain(*self._known)]
-        plans = np.stack((middle, *own, *others))
-        rho = self._judged(np.repeat(row, len(plans), 0), plans)
-        first = 1 + len(own)
-        kept = [*range(first), *(first + (-rho[first:]).argsort(kind="stable")[:KEPT])]
-        return plans[kept], rho[kept]
-
-    def _calm(self, state: Numbers, request: PhaseRequest, found: Phase) -> Phase:
-        """Return the phase with unneeded controls held at the middle of their ranges."""
-        row, plan = self._row(state, replace(request, last=found.sample)), found.plan
-        for control, middle in enumerate(self._middle):
-            calmer = np.where(np.arange(len(self._middle)) == control, middle, plan)
-            if self._judged(row, calmer[None])[0] >= found.margin:
-                plan = calmer
-        return found if plan is found.plan else self._phase(row, plan)
 
     def _improved(
         self, row: Numbers, request: PhaseRequest, plans: Numbers, random: Generator, effort: int

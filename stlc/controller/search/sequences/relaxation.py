@@ -267,7 +267,9 @@ class Relaxation:
         if not jump.guard.columns & controls:
             return RelaxedStep(condition, condition, 1, jump)
         free = jump.guard.map_terms(lambda part: YES if part.columns & controls else part)
-        effects = (_equal(name, value) for name, value in fixed.items())
+        effects = (
+            ir.Predicate(0.5 - (ir.Signal(name) - value).apply("abs")) for name, value in fixed.items()
+        )
         return RelaxedStep(ir.BoolOp.joined("and", (free, *extra)), ir.BoolOp.joined("and", effects), 0, jump)
 
     def _left(self, clause: Sequence[ir.Formula], fixed: Mapping[str, ir.Num]) -> ir.Formula:
@@ -516,8 +518,3 @@ def _settled(num: ir.Num, mode: ir.Formula | None, *, holds: bool = True) -> ir.
             return deeper(yes if holds else no)
         case _:
             return num.map_children(numbers=deeper)
-
-
-def _equal(name: str, value: ir.Num) -> ir.Formula:
-    apart = (ir.Signal(name) - value).apply("abs")
-    return ir.Predicate(0.5 - apart)
