@@ -71,7 +71,10 @@ def compared(function: FunctionDecl, *, seed: int = 0) -> Comparison:
             theirs = _by_library(function, q)
     except Exception as error:  # any error about a description that it does not support
         return Comparison(function.name, None, f"{LIBRARY} does not take it: {type(error).__name__}")
-    ours = _by_body(function.body, q)
+    args = tuple(ir.Signal(f"a{index}") for index in range(q.shape[1]))
+    program = ArrayProgram({str(i): call for i, call in enumerate(function.body.calls_of("f", args))})
+    found = program({"": q[:, 0], **{arg.name: q[:, i] for i, arg in enumerate(args)}})
+    ours = np.stack([np.broadcast_to(found[str(i)], len(q)) for i in range(3)], 1)
     far = float(np.abs(ours - theirs).max())
     if not far <= _NEAR * max(1.0, float(np.abs(ours).max())):
         raise SystemFileError.of(
@@ -92,14 +95,3 @@ def _by_library(function: FunctionDecl, q: Doubles) -> Doubles:
     chain = pytorch_kinematics.build_serial_chain_from_urdf(text, *arguments).to(dtype=torch.float64)
     found: Doubles = chain.forward_kinematics(torch.from_numpy(q)).get_matrix()[:, :3, 3].numpy()
     return found
-
-
-def _by_body(body: ir.Body, q: Doubles) -> Doubles:
-    """Positions of a link in metres, (n, 3), at the joint positions `q`, (n, joints).
-
-    The positions are computed from `body`, the expressions of the kinematics.
-    """
-    args = tuple(ir.Signal(f"a{index}") for index in range(q.shape[1]))
-    program = ArrayProgram({str(i): call for i, call in enumerate(body.calls_of("f", args))})
-    found = program({"": q[:, 0], **{arg.name: q[:, i] for i, arg in enumerate(args)}})
-    return np.stack([np.broadcast_to(found[str(i)], len(q)) for i in range(3)], 1)

@@ -293,23 +293,16 @@ class System:
         inputs = dict(zip(self.control_names, u.permute(2, 1, 0).contiguous().unbind(0), strict=True))
         moving = {name: column for name, column in start.items() if name not in self._timer_step.moving}
         columns = self._stepper(switch).rollout(moving, inputs, u.shape[1], TORCH, switch)
-        return columns | self._timers_over_time(start, columns, u.shape[1])
+        if not self.timers:
+            return columns
+        with torch.no_grad():
+            seen = {name: column[:-1].detach() for name, column in columns.items()}
+            first = {timer.name: start[timer.name] for timer in self.timers}
+            return columns | self._timer_step.rollout(first, seen, u.shape[1], TORCH)
 
     def _later(self, before: Columns) -> Columns:
         with torch.no_grad():
             return self._timer_step.step(before, TORCH)
-
-    def _timers_over_time(self, start: Columns, columns: Columns, steps: int) -> Columns:
-        """Roll out the timers from their initial values in `start`, (1, B) each.
-
-        `columns` has the other states over time, (T+1, B) each. Returns timer -> values over time, (T+1, B).
-        """
-        if not self.timers:
-            return {}
-        with torch.no_grad():
-            seen = {name: column[:-1].detach() for name, column in columns.items()}
-            first = {timer.name: start[timer.name] for timer in self.timers}
-            return self._timer_step.rollout(first, seen, steps, TORCH)
 
     @cached_property
     def _timer_step(self) -> Stepper:

@@ -219,13 +219,19 @@ class SystemDecl:
             (jump.name, f"when {jump.text}", ", ".join(f"{each.name} := {each.text}" for each in jump.resets))
             for jump in self.jumps
         ]
-        moves = {name: f"{rate.format(name)} {text}" for name, text in flow.items()}
+        columns = self.signature.columns
+        moves = {each.name: "set from outside" if each.role == "env" else "constant" for each in columns}
+        moves |= {name: f"{rate.format(name)} {text}" for name, text in flow.items()}
         moves |= {assign.name: f"= {assign.text}" for assign in self.updates}
         apart = {*self.hidden, *(each.name for each in self.inputs)}
-        states = [column for column in self.signature.columns if column.name not in apart]
+        states = [
+            (each.name, f"[{each.unit}]" * bool(each.unit.text), _values(each), moves[each.name])
+            for each in columns
+            if each.name not in apart
+        ]
         weights = sum(situation.weight for situation in self.init.mixture) or 1.0
         blocks = (
-            ("states", [_state(each, moves.get(each.name)) for each in states]),
+            ("states", states),
             ("input signals", [_input(each) for each in self.inputs]),
             (
                 "controls",
@@ -300,11 +306,6 @@ class SystemDecl:
 
 
 Row = tuple[str, ...]
-
-
-def _state(column: Column, moves: str | None) -> Row:
-    moves = moves or ("set from outside" if column.role == "env" else "constant")
-    return column.name, f"[{column.unit}]" if column.unit.text else "", _values(column), moves
 
 
 def _input(decl: InputDecl) -> Row:

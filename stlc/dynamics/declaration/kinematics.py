@@ -175,8 +175,15 @@ def position(joints: Sequence[Joint]) -> ir.Body:
         if joint.kind == "revolute":
             point = _turned(joint.axis, point, ir.Signal(formals[joint.name]), writer)
         elif joint.kind == "prismatic":
-            point = _pushed(joint.axis, point, ir.Signal(formals[joint.name]), writer)
-        point = _affine(joint.rotation, joint.offset, point, writer)
+            length = ir.Signal(formals[joint.name])
+            point = tuple(
+                writer.name(_sum(part, _product(ir.Const(float(share)), length)), NAME)
+                for part, share in zip(point, joint.axis, strict=True)
+            )
+        point = tuple(
+            writer.name(_sum(part, ir.Const(float(shift))), NAME)
+            for part, shift in zip(_linear(joint.rotation, point), joint.offset, strict=True)
+        )
     return ir.Body(tuple(formals.values()), tuple(writer.lets), point)
 
 
@@ -195,25 +202,6 @@ def _turned(axis: Doubles, point: Point, angle: ir.Num, writer: Assignments) -> 
     return tuple(
         writer.name(_sum(_sum(kept, _product(cosine, part)), _product(sine, turned)), NAME)
         for kept, part, turned in zip(along, across, aside, strict=True)
-    )
-
-
-def _pushed(axis: Doubles, point: Point, length: ir.Num, writer: Assignments) -> Point:
-    """Translate a point along an axis by `length`, in metres.
-
-    Coordinates are expressions. Intermediate results are appended to `writer`.
-    """
-    return tuple(
-        writer.name(_sum(part, _product(ir.Const(float(share)), length)), NAME)
-        for part, share in zip(point, axis, strict=True)
-    )
-
-
-def _affine(rotation: Doubles, offset: Doubles, point: Point, writer: Assignments) -> Point:
-    """Return the point `rotation @ point + offset`, whose coordinates are appended to `writer`."""
-    return tuple(
-        writer.name(_sum(part, ir.Const(float(shift))), NAME)
-        for part, shift in zip(_linear(rotation, point), offset, strict=True)
     )
 
 

@@ -93,7 +93,12 @@ def _table(entry: Entry, cx: Context) -> TableDecl | None:
         points: tuple[Row, ...] = (_row(keys.at, units[0], f"`at` of {where}", cx),)
         rows: tuple[Node, ...] = (keys.values,)
     else:
-        points = _rows(keys.at, units, f"`at` of {where}", cx)
+        at = cx.reader.items(keys.at, f"`at` of {where}")
+        if len(at) == len(units):
+            points = tuple(_row(*each, f"`at` of {where}", cx) for each in zip(at, units, strict=True))
+        else:
+            cx.reader.wrong(keys.at, f"`at` of {where}", f"{len(units)} lists of numbers, one per argument")
+            points = ((),) * len(units)
         rows = cx.reader.items(keys.values, f"`values` of {where}")
     numbers = tuple(_numbers(row, keys.unit, f"`values` of {where}", cx) for row in rows)
     values = tuple(
@@ -132,15 +137,6 @@ def _units(node: Node | None, where: str, cx: Context) -> tuple[Unit, ...] | Non
         cx.reader.wrong(node, f"`of` of {where}", "one or two arguments", advice)
         return None
     return known or None
-
-
-def _rows(node: Node, units: Sequence[Unit], where: str, cx: Context) -> tuple[Row, ...]:
-    """Read one row of numbers per unit; `where` names the list in messages."""
-    items = cx.reader.items(node, where)
-    if len(items) != len(units):
-        cx.reader.wrong(node, where, f"{len(units)} lists of numbers, one per argument")
-        return ((),) * len(units)
-    return tuple(_row(item, unit, where, cx) for item, unit in zip(items, units, strict=True))
 
 
 def _row(node: Node, unit: Unit, where: str, cx: Context) -> Row:

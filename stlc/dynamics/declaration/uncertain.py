@@ -72,7 +72,8 @@ def uncertain_numbers(decl: SystemDecl, found: SystemKeys) -> UncertainNumbers:
             what = f"the delay `{delay.entry.key.text}` of {delay.steps} steps"
             advice = f"`at_most` makes it vary; or list what may be off, without {what}"
             raise _refused(what, "a fixed delay is a number of steps", delay.entry.place("by"), advice)
-    compared = used.compared.union(*(_names_in(place.node) for place in _timer_places(found)))
+    timers = [entry.get(key) for _, entry in _entries(found.state) for key in ("run", "reset_when", "to")]
+    compared = used.compared.union(*(_names_in(node) for node in timers if node is not None))
     fixed = compared.union(*(_names_in(place.node) for place in _fixed_places(found)))
     exact, computed = _with_sources(fixed & used.constants, reads), _with_sources(used.computed_with, reads)
     literals = {place: node.span.text for place, node in used.literals.items()}
@@ -137,14 +138,6 @@ def _fixed_places(found: SystemKeys) -> Iterator[_Place]:
                 free = section == "state" and not (isinstance(clamp, Scalar) and clamp.boolean)
                 if node is not None and not free and not (key == "by" and most is not None):
                     yield _Place(node, f"`{key}` of `{name}`")
-
-
-def _timer_places(found: SystemKeys) -> Iterator[_Place]:
-    """Yield the conditions of timers, and the values to which they are set."""
-    for name, entry in _entries(found.state):
-        for key in ("run", "reset_when", "to"):
-            if (node := entry.get(key)) is not None:
-                yield _Place(node, f"`{key}` of `{name}`")
 
 
 def _drawn_places(found: SystemKeys, decl: SystemDecl) -> Iterator[_Place]:
@@ -241,11 +234,6 @@ def _computed(node: ast.Node) -> tuple[str, ...]:
             return _COMPUTED.get(type(node), ())
 
 
-def _is_point(node: ast.Quantity) -> bool:
-    known = Unit.SYMBOLS.get(node.unit)
-    return known is not None and bool(known.offset)
-
-
 def _place(node: ast.Quantity) -> str:
     return f"?{node.span.source.name}:{node.span.start}"
 
@@ -283,7 +271,8 @@ class NumbersInUse:
         """
         match node:
             case ast.Quantity(span=span, value=value):
-                if called or not value or _is_point(node):
+                known = Unit.SYMBOLS.get(node.unit)
+                if called or not value or (known is not None and known.offset):
                     return node
                 self.literals[_place(node)] = node
                 return ast.Binary(span, "*", node, ast.Name(span, _place(node)))

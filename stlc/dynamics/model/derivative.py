@@ -34,8 +34,13 @@ def _along(num: ir.Num, slopes: Mapping[str, ir.Num]) -> ir.Num | None:
             return slopes.get(name)
         case ir.Where(cond, yes, no):
             return _choice(cond, _along(yes, slopes), _along(no, slopes))
-        case ir.Op("min" | "max" as name, args):
-            return _extreme(name, args, slopes)
+        case ir.Op("min" | "max" as name, (best, *rest)):  # that of the first argument that is extreme
+            found = _along(best, slopes)
+            for arg in rest:
+                gap = best - arg if name == "max" else arg - best
+                found = _choice(ir.Predicate(gap), found, _along(arg, slopes))
+                best = _call(name, best, arg)
+            return found
         case ir.Op("clip", (x, low, high)):
             return _along(_call("min", _call("max", x, low), high), slopes)
         case ir.Op("norminf", args):
@@ -54,16 +59,6 @@ def _choice(cond: ir.Formula, yes: ir.Num | None, no: ir.Num | None) -> ir.Num |
     if yes is None and no is None:
         return None
     return cond.select(yes or ir.Const(0.0), no or ir.Const(0.0))
-
-
-def _extreme(name: str, args: Sequence[ir.Num], slopes: Mapping[str, ir.Num]) -> ir.Num | None:
-    """Derivative of `min` or `max`: that of the first argument that is extreme."""
-    best, found = args[0], _along(args[0], slopes)
-    for arg in args[1:]:
-        gap = best - arg if name == "max" else arg - best
-        found = _choice(ir.Predicate(gap), found, _along(arg, slopes))
-        best = _call(name, best, arg)
-    return found
 
 
 def _chain(

@@ -54,8 +54,10 @@ class LocatedJumps:
             there = self._named(segment.at(at, segment.moving))
             state = self._named(self.happened(there, self._due(there, waiting)))
             rest = self.writer.name(rest * (_ONE - at), "rest#{}")
-            if index < ROUNDS - 1:
-                waiting = self._still(there, state)
+            if index < ROUNDS - 1:  # a jump waits whose guard holds both before and after these jumps
+                guards = zip(self._guards(there), self._guards(state), strict=True)
+                flags = (self.writer.name(ir.BoolOp("and", each).indicator(), "waits#{}") for each in guards)
+                waiting = tuple(ir.Predicate(0.5 - flag) for flag in flags)
         return self._named(integrate(_scaled(rate, rest), state, length, self._named))
 
     def _named(self, state: State) -> State:
@@ -70,14 +72,6 @@ class LocatedJumps:
             return self._guards(state)
         pairs = zip(self._guards(state), waiting, strict=True)
         return tuple(guard & free for guard, free in pairs)
-
-    def _still(self, before: State, after: State) -> Formulas:
-        """Conditions that the guard of each jump does not hold both before and after the jumps."""
-        found: list[ir.Formula] = []
-        for pair in zip(self._guards(before), self._guards(after), strict=True):
-            flag = self.writer.name(ir.BoolOp("and", pair).indicator(), "waits#{}")
-            found.append(ir.Predicate(0.5 - flag))
-        return tuple(found)
 
     def _first(self, segment: _Segment, waiting: Formulas | None) -> ir.Num:
         """Share of a segment after which a jump happens for the first time; 1 if none does.

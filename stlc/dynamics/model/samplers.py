@@ -180,7 +180,13 @@ def _draw(sampler: str, args: list[Tensor], rows: Rows) -> Tensor:
             return mean + deviation * rows.normals()
         case "truncnorm", [mean, deviation, low, high]:
             first, last = ((end - mean) / deviation for end in (low, high))
-            return torch.clamp(mean + deviation * _between(first, last, rows.uniforms()), low, high)
+            share = rows.uniforms()
+            chance = torch.lerp(torch.special.ndtr(first), torch.special.ndtr(last), share)
+            found: Tensor = torch.special.ndtri(chance)
+            far = (first * last > 0.0) & (torch.minimum(first.abs(), last.abs()) > _FAR)
+            if bool(far.any()):
+                found = torch.where(far, _in_tail(first, last, share), found)
+            return torch.clamp(mean + deviation * found, low, high)
         case "bernoulli", [chance]:
             return (rows.uniforms() < chance).to(torch.float64)
         case "randint", [low, high]:
@@ -193,16 +199,11 @@ def _draw(sampler: str, args: list[Tensor], rows: Rows) -> Tensor:
             raise ValueError(f"unknown sampler {sampler}")
 
 
-def _between(first: Tensor, last: Tensor, share: Tensor) -> Tensor:
-    """Standard normal numbers from `first` to `last`, at the given shares of the probability between them."""
-    quantile = torch.lerp(torch.special.ndtr(first), torch.special.ndtr(last), share)
-    found: Tensor = torch.special.ndtri(quantile)
-    far = (first * last > 0.0) & (torch.minimum(first.abs(), last.abs()) > _FAR)
-    return torch.where(far, _in_tail(first, last, share), found) if bool(far.any()) else found
-
-
 def _in_tail(first: Tensor, last: Tensor, share: Tensor) -> Tensor:
-    """Same as `_between` where both ends are far on one side, whose probabilities only logarithms hold."""
+    """Truncated normal numbers where both ends are far on one side; only logarithms hold their probabilities.
+
+    `share`: share of the probability between the ends that is below the number.
+    """
     one, other = first.abs(), last.abs()
     near, end = torch.minimum(one, other), torch.maximum(one, other)
     start, least = (torch.special.log_ndtr(-each) for each in (near, end))

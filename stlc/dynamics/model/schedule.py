@@ -240,8 +240,12 @@ class Hoist:
         terms = _terms(num)
         moving = [(sign, self.split(term)) for sign, term in terms if term.columns & self.moving]
         steady = [(sign, term) for sign, term in terms if not term.columns & self.moving]
+        constant = sum(sign * term.value for sign, term in steady if isinstance(term, ir.Const))
+        variable = [(sign, term) for sign, term in steady if not isinstance(term, ir.Const)]
         total = _signed_sum(moving)
-        rest = _total(steady)
+        rest = _signed_sum(variable) if variable else ir.Const(constant)
+        if variable and constant != 0.0:
+            rest = rest + constant
         return total if rest == ir.Const(0.0) else total + self._steady(rest)
 
     def _product(self, num: ir.Num) -> ir.Num:
@@ -282,13 +286,3 @@ def _signed_sum(terms: Sequence[tuple[int, ir.Num]]) -> ir.Num:
     for sign, term in rest:
         total = total.apply("add" if sign > 0 else "sub", term)
     return total
-
-
-def _total(terms: list[tuple[int, ir.Num]]) -> ir.Num:
-    """Return the sum of loop-invariant (sign, term) pairs; the constants among them are added up."""
-    constant = sum(sign * term.value for sign, term in terms if isinstance(term, ir.Const))
-    variable = [(sign, term) for sign, term in terms if not isinstance(term, ir.Const)]
-    if not variable:
-        return ir.Const(constant)
-    total = _signed_sum(variable)
-    return total if constant == 0.0 else total + constant

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.assignments import Assignments
@@ -48,7 +48,7 @@ def build_step(decl: SystemDecl, *, soft: bool) -> ModelStep:
     moved = {assign.name for assign in decl.flow}
     for jump in decl.jumps:
         if not jump.located:
-            state = _jump(_given(jump, given), state, soft=soft)
+            state = _jump(jump, given, state, soft=soft)
         moved |= {assign.name for assign in jump.resets}
     reset = {assign.name for jump in decl.jumps for assign in jump.resets}
     state = {name: _clamped(decl, name, num) if name in reset else num for name, num in state.items()}
@@ -56,14 +56,6 @@ def build_step(decl: SystemDecl, *, soft: bool) -> ModelStep:
     moved |= {assign.name for assign in decl.updates}
     ordered = [name for name in decl.signature.names if name in moved | set(decl.clamps)]
     return ModelStep(tuple(writer.lets), {name: state[name] for name in ordered})
-
-
-def _given(jump: JumpDecl, given: State) -> JumpDecl:
-    """Return the jump with each control in it replaced by the actuator command in `given`."""
-    if not given:
-        return jump
-    resets = tuple(replace(each, value=each.value.substitute(given)) for each in jump.resets)
-    return replace(jump, guard=jump.guard.substitute(given), resets=resets)
 
 
 def _flow(decl: SystemDecl, writer: Assignments, state: State, given: State) -> State:
@@ -81,11 +73,11 @@ def _flow(decl: SystemDecl, writer: Assignments, state: State, given: State) -> 
         return {assign.name: assign.value.substitute(table) for assign in decl.flow}
 
     def happened(at: State, due: Sequence[ir.Formula]) -> State:
-        before = at
+        changed = dict(at)
         for jump, cond in zip(located, due, strict=True):
-            resets = tuple(replace(each, value=each.value.substitute(before)) for each in jump.resets)
-            at = _jump(replace(jump, guard=cond, resets=resets), at, soft=False)
-        return at
+            for assign in jump.resets:
+                changed[assign.name] = cond.select(assign.value.substitute(at), changed[assign.name])
+        return changed
 
     integrate = INTEGRATORS.get(decl.integrator)
     length = float(decl.dt) / decl.substeps
@@ -103,18 +95,21 @@ def _flow(decl: SystemDecl, writer: Assignments, state: State, given: State) -> 
     return state
 
 
-def _jump(jump: JumpDecl, state: State, *, soft: bool) -> State:
+def _jump(jump: JumpDecl, given: State, state: State, *, soft: bool) -> State:
     """Return the states after one jump; `state` is the result of the flow and of earlier jumps.
 
-    If `soft`, the jump is a differentiable blend, otherwise an exact choice.
+    If `soft`, the jump is a differentiable blend by the smooth indicator I_w of Eq. 6, which is exactly the
+    one or the other where I_w is 1 or 0. Otherwise it is an exact choice. `given` are the actuator commands.
     """
-    changed = dict(state)
+    changed, guard = dict(state), jump.guard.substitute(given)
     for assign in jump.resets:
-        flowed = changed[assign.name]
+        flowed, value = changed[assign.name], assign.value.substitute(given)
         if soft:
-            changed[assign.name] = _blend(jump.guard, assign.value, flowed, jump.sharpness)
+            weight = guard.indicator(jump.sharpness)
+            kept = (1.0 - weight) * flowed
+            changed[assign.name] = kept if value == ir.Const(0.0) else weight * value + kept
         else:
-            changed[assign.name] = jump.guard.select(assign.value, flowed)
+            changed[assign.name] = guard.select(value, flowed)
     return changed
 
 
@@ -132,17 +127,6 @@ def _updated(decl: SystemDecl, writer: Assignments, state: State) -> State:
         num = assign.value.substitute({**known, **before})
         known[assign.name] = writer.name(num, assign.name + "#{}") if assign.name in read else num
     return known
-
-
-def _blend(cond: ir.Formula, yes: ir.Num, no: ir.Num, sharpness: float | None) -> ir.Num:
-    """Return `I yes + (1 - I) no`, where I is the smooth indicator of `cond`.
-
-    I is the function I_w of Eq. 6, with values between 0 and 1. The result is exactly `yes` or `no` where I
-    is 1 or 0.
-    """
-    weight = cond.indicator(sharpness)
-    kept = (1.0 - weight) * no
-    return kept if yes == ir.Const(0.0) else weight * yes + kept
 
 
 def _clamped(decl: SystemDecl, name: str, num: ir.Num) -> ir.Num:

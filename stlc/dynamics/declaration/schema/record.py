@@ -311,22 +311,19 @@ def reference(record: type, title: str) -> Iterator[str]:
     fields = {each.name: each for each in dataclasses.fields(record)}
     inner: list[tuple[type, str]] = []
     for name, each in keys_of(record).items():
-        default = "required" if each.required else _shown(fields[each.attribute].default)
-        yield f"| `{name}` | {_values(each.kind)} | {default} | {each.about} |"
+        default, shown = fields[each.attribute].default, ""
+        if each.required:
+            shown = "required"
+        elif isinstance(default, (bool, int, float, str)) and default != "":
+            shown = f"`{str(default).lower() if isinstance(default, bool) else default}`"
+        elif isinstance(default, tuple) and default and all(isinstance(part, int) for part in default):
+            shown = f"`{list(default)}`"
+        yield f"| `{name}` | {_values(each.kind)} | {shown} | {each.about} |"
         if each.kind.record is not None:
             inner.append((each.kind.record, name if title == "The file" else f"{title}.{name}"))
     yield ""
     for found, called in inner:
         yield from reference(found, called)
-
-
-def _shown(default: Any) -> str:
-    """Return the default of a key as it is printed in a table."""
-    if isinstance(default, (bool, int, float, str)) and default != "":
-        return f"`{str(default).lower() if isinstance(default, bool) else default}`"
-    if isinstance(default, tuple) and default and all(isinstance(each, int) for each in default):
-        return f"`{list(default)}`"
-    return ""
 
 
 def _values(kind: Kind) -> str:
