@@ -57,8 +57,15 @@ def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = Non
 
     for shot in prefix_shooting(grid.lengths, tried, NUMPY):
         if shot.found or shot.last:
-            source = BACKUP if shot.found else SAFEST
-            chosen = shot.chosen(None if shot.found else _falls(graphs, x, shot.plans.plan))
+            source, falls = BACKUP, None
+            if not shot.found:
+                source, plans = SAFEST, shot.plans.plan
+                size = max(grid.batch // graphs.facts.horizon, 1)
+                parts = [plans[at : at + size] for at in range(0, len(plans), size)]
+                falls = np.concatenate(
+                    [graphs.falls(np.repeat(x[None], len(part), 0), part) for part in parts]
+                ).T
+            chosen = shot.chosen(falls)
             return Found(shot.plans.of([int(chosen.argmax())]), source, shot.length)
     return Found(graphs.judged(x[None], own[None])[0], SAFEST, 0)
 
@@ -82,13 +89,6 @@ def _candidates(graphs: Graphs, x: Numbers, own: Numbers, length: int) -> Judged
         plans[:, length:] = tail[:, : own.shape[0] - length]
         parts.append(graphs.judged(starts, plans)[0])
     return joined(parts)
-
-
-def _falls(graphs: Graphs, x: Numbers, plans: Numbers) -> Numbers:
-    """Robustness of the safety requirements on first parts of plans from the state `x`, (time, plans)."""
-    size = max(graphs.facts.grid.batch // graphs.facts.horizon, 1)
-    parts = [plans[at : at + size] for at in range(0, len(plans), size)]
-    return np.concatenate([graphs.falls(np.repeat(x[None], len(part), 0), part) for part in parts]).T
 
 
 def finite(plans: Numbers, controls: Sequence[ControllerQuantity]) -> Numbers:

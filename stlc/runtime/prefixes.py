@@ -59,18 +59,14 @@ class PrefixGrid:
     def prefixes(self, length: int) -> NDArray[np.float64]:
         """Return the prefixes of `length` steps that are tried, (count, length, m)."""
         if self.size(length) > self.samples:
-            return self._sampled(length)
+            levels = np.array([len(values) for values in self.values] * length, dtype=np.uint64)
+            index = below(words(self.sampling, self.samples, len(levels)), levels)
+            index = index.reshape(self.samples, length, len(self.values))
+            return np.stack([np.array(each)[index[:, :, i]] for i, each in enumerate(self.values)], 2)
         actions = np.array(list(product(*self.values)), dtype=np.float64)
         places = len(actions) ** np.arange(length)[::-1]
         found: NDArray[np.float64] = actions[np.arange(self.size(length))[:, None] // places % len(actions)]
         return found
-
-    def _sampled(self, length: int) -> NDArray[np.float64]:
-        levels = np.array([len(values) for values in self.values] * length, dtype=np.uint64)
-        index = below(words(self.sampling, self.samples, len(levels)), levels)
-        index = index.reshape(self.samples, length, len(self.values))
-        columns = [np.array(values)[index[:, :, i]] for i, values in enumerate(self.values)]
-        return np.stack(columns, 2)
 
 
 def generators(dims: int) -> tuple[int, ...]:
