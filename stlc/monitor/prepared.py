@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeAlias
@@ -23,9 +22,6 @@ if TYPE_CHECKING:
     from stlc.monitor.judgement import RequirementVerdict, Verdict
 
 Floats: TypeAlias = NDArray[np.float64]
-
-_ROUNDING = 1e-6
-"""Share of a step by which times may be off the grid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,10 +128,9 @@ class Prepared:
         seen, samples, dt = self.seen(rule), self.signals.samples, self.signals.dt
         if seen is None or dt is None:
             return Part(0, self.record.samples)
-        first = math.ceil((seen.first - self.signals.t0) / dt - _ROUNDING)
-        stop = math.floor((seen.last - self.signals.t0) / dt + _ROUNDING) + 1
-        stop = max(min(stop, samples), min(first, samples - 1) + 1)
-        return Part(min(max(first, 0), samples - 1), stop, seen)
+        there = seen.samples(self.signals.t0, dt)
+        stop = max(min(there.stop, samples), min(there.start, samples - 1) + 1)
+        return Part(min(max(there.start, 0), samples - 1), stop, seen)
 
     def moment(self, sample: int) -> str:
         """Time of a sample as text; see `Timeline.moment`."""

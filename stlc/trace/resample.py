@@ -159,6 +159,11 @@ class TimeRange:
         """Return the time that both spans share."""
         return TimeRange(max(self.first, other.first), min(self.last, other.last))
 
+    def samples(self, t0: float, dt: float) -> range:
+        """Samples of the grid from `t0` on, with step `dt`, in this time; they may be off by rounding."""
+        first = math.ceil((self.first - t0) / dt - ROUNDING)
+        return range(first, math.floor((self.last - t0) / dt + ROUNDING) + 1)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moments:
