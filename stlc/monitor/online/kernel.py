@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, final
 
 import numpy as np
@@ -19,8 +19,6 @@ from stlc.monitor.instants import beyond, window_of
 from stlc.monitor.online.history import Floats
 from stlc.monitor.online.tally import Asked, JudgedInstants, RequirementSummary
 from stlc.monitor.signals import Gap
-
-_HEAD = "#define REAL double\n#define API\n"
 
 _MOST = 1 << 32
 """Greatest size of the state in bytes."""
@@ -53,10 +51,16 @@ _FUNCTIONS = {
 """Function of `streams.c` -> types of its result and of its arguments."""
 
 
+@lru_cache(maxsize=256)
+def _library(text: str) -> ctypes.CDLL | None:
+    """Library of C text after the types of `streams.c`, which takes milliseconds to find on the disk."""
+    return native.load(f"#define REAL double\n#define API\n{runtime()[0]}{text}")
+
+
 @cache
 def _transducers() -> ctypes.CDLL | None:
     """Library of the transducers of all monitors."""
-    library = native.load(_HEAD + "".join(runtime()))
+    library = _library(runtime()[1])
     for name, types in _FUNCTIONS.items() if library else ():
         function = getattr(library, name)
         function.restype, *function.argtypes = map(_TYPES.get, types)
@@ -113,7 +117,7 @@ class StreamKernel:
         """
         program = streams_of(rules, signals, cut=any(each.ending == "truncate" for each in asked))
         library = _transducers()
-        predicates = None if library is None else native.load(f"{_HEAD}{runtime()[0]}{program.predicates}")
+        predicates = None if library is None else _library(program.predicates)
         if library is None or predicates is None:
             return None
         try:

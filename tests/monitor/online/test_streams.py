@@ -12,13 +12,13 @@ from helpers import formula_strategies as random_formulas
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc import native
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.simplify import simplify
 from stlc.compile.pipeline import Compiled
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.instants import rule_bounds
+from stlc.monitor.online import kernel
 from stlc.monitor.online.kernel import Streamed
 from stlc.monitor.online.online import How, Online
 from stlc.monitor.online.recompute import GrowingBounds, Recomputed
@@ -128,7 +128,7 @@ def test_without_a_compiler_a_stream_is_evaluated_anew(written, trace, end) -> N
     formula = simplify(random_formulas.GRID.lower(written, []))
     at = None if random_formulas.a_rule(formula).uses_end else "all"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(native, "load", lambda _: None)
+        patch.setattr(kernel, "_library", lambda _: None)
         online = check_stream(formula, trace, How(at, end))
     assert isinstance(online._find(online.requirements[0]), Recomputed)
 

@@ -158,20 +158,11 @@ class Node:
 
 def _reads(form: ir.Formula) -> tuple[int, int]:
     """Least and greatest instant, relative to now, at which a node reads its operands or signals."""
-    match form:
-        case ir.Predicate(num):
-            reach = num.farthest
-            return -reach.past if reach.past < 1 << 29 else 0, reach.future
-        case ir.Temporal(window=window):
-            return window.lo, window.hi or 0
-        case ir.PastTemporal(window=window):
-            return -(window.hi or 0), -window.lo
-        case ir.Shift(steps) if not isinstance(form, Begun):
-            return steps, steps
-        case ir.Until(window=window):
-            return 0, window.hi or 0
-        case _:
-            return 0, 0
+    if isinstance(form, ir.Predicate):
+        past, future = form.num.farthest
+        return -past if past < 1 << 29 else 0, future
+    first, last = form.offsets[-1] if isinstance(form, ir.Operator) else NOW
+    return first or 0, last or 0
 
 
 def _ring(rows: int) -> int:
@@ -305,19 +296,16 @@ class Graph:
             return spans - count
 
         for node in self.nodes:
-            form, kind = node.form, _KINDS[type(node.form)]
-            lo, hi, flags = 0, 0, 0
+            form, windows = node.form, isinstance(node.form, (ir.Temporal, ir.PastTemporal))
+            lo, hi = sorted((abs(node.near), abs(node.far)))
             match form:
+                case ir.Predicate():
+                    lo = hi = 0
                 case ir.Truth(value):
-                    lo = 2 if value else 1
-                case Begun(steps):
-                    lo = steps
-                case ir.Shift(steps, _, outside, _, weak):
-                    lo, hi = steps, 0 if outside is None else 2 if outside else 1
-                    flags |= _WEAK * weak
-                case ir.Windowed(window=around):
-                    lo, hi = around.lo, around.hi or 0
-            flags |= _DUAL * node.dual
+                    lo = _TRUTHS[value]
+                case ir.Shift(steps, _, outside):
+                    lo, hi = steps, _TRUTHS[outside]
+            flags = _DUAL * node.dual | _WEAK * getattr(form, "weak", False)
             flags |= _UNCUT * isinstance(form, Lasting) | _ENDLESS * node.endless
             flags |= _LASTS * node.lasts | _ROOT * (node.index == self.root) | _AHEAD * node.foreseen
             operands = out.add(out.operands, [self._read(first, arg, node.since) for arg in node.args])
@@ -325,32 +313,19 @@ class Graph:
             rows, kept = node.rows, _ring(node.kept + 1)
             window = ends = place = skip = 0
             ring = self.rings[node.index] = 0 if node.endless else room(kept)
-            if not node.endless:
-                match form:
-                    case ir.Temporal() | ir.PastTemporal():
-                        window, place, ints = room(hi - lo + 2), ints, ints + 1
-                    case ir.Until():
-                        window, place, ints = room(2 * (hi + 2)), ints, ints + 1
-                    case ir.Since():
-                        window = room(1)
+            if windows or (isinstance(form, ir.Until) and not node.endless):
+                window, place, ints = room((hi - lo + 2) * (1 if windows else 2)), ints, ints + 1
+            elif isinstance(form, ir.Since):
+                window = room(1)
             truth = 0 if isinstance(form, ir.Truth) else out.room("truths", rows)
-            if isinstance(form, (ir.Temporal, ir.PastTemporal)):
-                skip, ends = out.room("ints", rows), out.room("ints", self.nodes[node.args[0]].rows)
-            elif isinstance(form, ir.BoolOp):
+            if windows or isinstance(form, ir.BoolOp):
                 skip = out.room("ints", rows)
-            lasting, windows = 2 * node.lasts, isinstance(form, (ir.Temporal, ir.PastTemporal))
-            since = out.room("times", 3 if windows else lasting)
-            sizes = (
-                node.delay,
-                node.age,
-                node.ahead,
-                operands,
-                len(node.args),
-                readers,
-                len(node.readers),
-            )
+            if windows:
+                ends = out.room("ints", self.nodes[node.args[0]].rows)
+            since = out.room("times", 3 if windows else 2 * node.lasts)
+            sizes = (node.delay, node.age, node.ahead, operands, len(node.args), readers, len(node.readers))
             places = (ring, kept - 1, window, place, truth, rows - 1, skip, ends, since)
-            out.nodes.append((kind, flags, lo, hi, *sizes, *places))
+            out.nodes.append((_KINDS[type(form)], flags, lo, hi, *sizes, *places))
         entries = self._entries(first, out)
         bits, coefficients = len(self.coefficients), 0
         if bits:
@@ -468,6 +443,7 @@ class Graph:
 
 
 _DUAL, _WEAK, _UNCUT, _ENDLESS, _LASTS, _ROOT, _AHEAD = 1, 2, 4, 8, 16, 32, 64
+_TRUTHS = {None: 0, False: 1, True: 2}
 _KINDS: dict[type, int] = {
     ir.Truth: 0,
     ir.Predicate: 1,
