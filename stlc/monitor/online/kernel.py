@@ -11,7 +11,7 @@ from typing import Any, final
 import numpy as np
 
 from stlc import native
-from stlc.compile.backends.c.streams import TABLES, Rule, Streams, runtime, streams_of
+from stlc.compile.backends.c.streams import SIZES, TABLES, Rule, Streams, runtime, streams_of
 from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.ir import nodes as ir
 from stlc.compile.pipeline import CompiledRequirement
@@ -29,10 +29,7 @@ class _Tables(ctypes.Structure):
 
     _fields_ = (
         *((name, ctypes.c_void_p) for name in (*TABLES.values(), "predicates")),
-        *(
-            (name, ctypes.c_int32)
-            for name in ("signals", "rows", "judged", "spans", "times", "ints", "truths")
-        ),
+        *((name, ctypes.c_int32) for name in SIZES),
     )
 
 
@@ -166,20 +163,12 @@ class Streamed:
     @property
     def tally(self) -> RequirementSummary:
         """Summary of the counted starts."""
-        (instants, holds, fails, low_at, high_at), (low, high, *_) = self._counted()
-        return RequirementSummary(instants, holds, fails, low, high, low_at, high_at, self.asked.begin)
-
-    def _counted(self) -> tuple[list[int], list[float]]:
-        """Counts, the least bounds, and bounds at the start that was counted last."""
-        counts, bounds = np.zeros(5, dtype=np.int64), np.zeros(6)
-        kernel = self.kernel
+        counts, bounds, kernel = np.zeros(5, dtype=np.int64), np.zeros(6), self.kernel
         kernel.library.stlc_tally(kernel.at, self.number, counts.ctypes.data, bounds.ctypes.data)
-        return counts.tolist(), bounds.tolist()
-
-    @property
-    def counted(self) -> tuple[float, float]:
-        """Bounds on the robustness at the start that was counted last."""
-        return tuple(self._counted()[1][2:4])  # type: ignore[return-value]
+        instants, holds, fails, low_at, high_at = counts.tolist()
+        low, high, least, most, *_ = bounds.tolist()
+        found = (instants, holds, fails, low_at, high_at, low, high, (least, most), self.asked.begin)
+        return RequirementSummary(*found)
 
     def judged(self, starts: range, *, ended: bool = False) -> JudgedInstants:
         """Bounds and verdicts at starts that are not counted, over all continuations of the trace.
@@ -188,11 +177,8 @@ class Streamed:
         """
         asked, cut = self.asked, self.asked.ending == "truncate"
         out = self._look(starts, cut=cut, ended=ended)
-        if (
-            cut
-            and ended
-            and (outside := beyond(asked.rule, starts, self.kernel.samples, asked.horizon)).any()
-        ):
+        if cut and ended:
+            outside = beyond(asked.rule, starts, self.kernel.samples, asked.horizon)
             other = self._look(starts, cut=True, ended=False)[outside]
             out[outside, ::2] = np.minimum(out[outside, ::2], other[:, ::2])
             out[outside, 1::2] = np.maximum(out[outside, 1::2], other[:, 1::2])

@@ -281,7 +281,7 @@ class Online:
         watched = self._find(name)
         tally = watched.tally
         if tally.instants and start == tally.next - 1:
-            return watched.counted
+            return tally.last
         if start not in watched.asked.starts(tally.next, self.samples):
             raise usage(f"`{name}` is not open at sample {start}")
         judged = watched.judged(range(start, start + 1))
@@ -294,7 +294,7 @@ class Online:
         judged = watched.judged(watched.asked.starts(tally.next, self.samples))
         ends, until = np.array((judged.low, judged.high)), tally.with_more(judged)
         if tally.instants:
-            ends = np.c_[ends, watched.counted]
+            ends = np.c_[ends, tally.last]
         low, high = ends.min(1).tolist()
         return Margin(until.status, low, high, until.fails)
 

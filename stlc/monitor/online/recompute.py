@@ -7,7 +7,6 @@ whose end moves.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -136,14 +135,12 @@ class Recomputed:
     Attributes:
         asked: the requirement.
         tally: as of `Streamed`.
-        counted: as of `Streamed`.
         news: starts that the latest samples decided, in order, and their verdicts.
     """
 
     asked: Asked
     _history: ColumnHistory
     tally: RequirementSummary = field(init=False)
-    counted: tuple[float, float] = (-math.inf, math.inf)
     news: dict[int, Status] = field(default_factory=dict)
     _values: GrowingBounds = field(init=False)
     _final: Extremum | None = field(init=False)
@@ -179,8 +176,6 @@ class Recomputed:
         settled = min(self._values.settled(samples), samples - self.asked.lag)
         count = min(max(settled - starts.start, 0), len(starts))
         self.tally = self.tally.with_more(judged, count)
-        if count:
-            self.counted = float(judged.low[count - 1]), float(judged.high[count - 1])
         self._decided = known[count:]
         if self._final is not None:
             self._final.take(self._history)

@@ -84,21 +84,23 @@ class RequirementSummary:
         instants: number of counted instants.
         holds: number of instants at which the requirement is certainly satisfied.
         fails: number of instants at which the requirement is certainly violated.
+        low_at: instant of `low`.
+        high_at: instant of `high`.
         low: minimum over the instants of the least robustness over all continuations; +inf if there are no
             instants.
         high: minimum over the instants of the greatest robustness over all continuations.
-        low_at: instant of `low`.
-        high_at: instant of `high`.
+        last: bounds on the robustness at the instant that was counted last.
         first: the first counted instant.
     """
 
     instants: int = 0
     holds: int = 0
     fails: int = 0
-    low: float = math.inf
-    high: float = math.inf
     low_at: int = 0
     high_at: int = 0
+    low: float = math.inf
+    high: float = math.inf
+    last: tuple[float, float] = (-math.inf, math.inf)
     first: int = 0
 
     def with_more(self, judged: JudgedInstants, count: int | None = None) -> RequirementSummary:
@@ -111,8 +113,9 @@ class RequirementSummary:
             least, low_at = float(low.min()), self.next + int(low.argmin())
         if high.min() < most:
             most, high_at = float(high.min()), self.next + int(high.argmin())
+        last = float(low[-1]), float(high[-1])
         counts = self.instants + len(low), self.holds + int(holds.sum()), self.fails + int(fails.sum())
-        return RequirementSummary(*counts, least, most, low_at, high_at, self.first)
+        return RequirementSummary(*counts, low_at, high_at, least, most, last, self.first)
 
     @property
     def next(self) -> int:

@@ -41,8 +41,6 @@ _ENTRIES = 256
 _LARGEST = 1 << 31
 """Rows of a ring of values from which a monitor is refused."""
 
-Lines: TypeAlias = list[str]
-
 
 class Lasting(ir.Temporal):
     """Left side of an `until` before its window; the end of the trace does not cut it."""
@@ -81,17 +79,16 @@ def _windowed(whole: Any, least: str) -> ir.Formula:
         return whole  # type: ignore[no-any-return]
     left, right = (ir.Truth(not every), whole.body) if bounded else (whole.left, whole.right)
     kind = ir.Since if whole.back else ir.Until
-    op = whole.op if not bounded else kind.names[0 if every else 1]
     window = ir.Window(0, None if hi is None or whole.back else hi - lo)
-    node: ir.Formula = kind(op, window, left, right)  # type: ignore[arg-type]
+    node: ir.Formula = kind(kind.names[not every], window, left, right)  # type: ignore[arg-type]
     if lo:
         node = ir.Shift(-lo, node, outside=every) if whole.back else ir.Shift(lo, node, weak=every)
     parts, extremum = [node], ir.PastTemporal if whole.back else ir.Temporal
     if hi is not None:
-        parts.append(extremum(extremum.names[0 if every else 1], whole.window, right))  # type: ignore[arg-type]
+        parts.append(extremum(extremum.names[not every], whole.window, right))  # type: ignore[arg-type]
     if lo and not bounded:
         held: Any = extremum if whole.back else Lasting
-        parts.append(held(extremum.names[1 if every else 0], ir.Window(0, lo - 1), left))
+        parts.append(held(extremum.names[every], ir.Window(0, lo - 1), left))
     if len(parts) == 1:
         return node
     together = ir.BoolOp("or" if every else "and", tuple(parts))
@@ -286,9 +283,9 @@ class Graph:
 
     # ------------------------------------------------------------------------- tables
 
-    def tables(self, out: _Tables, *, cut: bool) -> int:
+    def tables(self, out: Streams, *, cut: bool) -> int:
         """Add the tables of the graph; return its number."""
-        first, spans, ints = len(out.nodes), 0, 0
+        first, spans, ints = len(out.tables["nodes"]), 0, 0
 
         def room(count: int) -> int:
             nonlocal spans
@@ -308,8 +305,8 @@ class Graph:
             flags = _DUAL * node.dual | _WEAK * getattr(form, "weak", False)
             flags |= _UNCUT * isinstance(form, Lasting) | _ENDLESS * node.endless
             flags |= _LASTS * node.lasts | _ROOT * (node.index == self.root) | _AHEAD * node.foreseen
-            operands = out.add(out.operands, [self._read(first, arg, node.since) for arg in node.args])
-            readers = out.add(out.readers, [(first + reader,) for reader in node.readers])
+            operands = out.add("operands", *(self._read(first, arg, node.since) for arg in node.args))
+            readers = out.add("readers", *((first + reader,) for reader in node.readers))
             rows, kept = node.rows, _ring(node.kept + 1)
             window = ends = place = skip = 0
             ring = self.rings[node.index] = 0 if node.endless else room(kept)
@@ -325,71 +322,45 @@ class Graph:
             since = out.room("times", 3 if windows else 2 * node.lasts)
             sizes = (node.delay, node.age, node.ahead, operands, len(node.args), readers, len(node.readers))
             places = (ring, kept - 1, window, place, truth, rows - 1, skip, ends, since)
-            out.nodes.append((_KINDS[type(form)], flags, lo, hi, *sizes, *places))
-        entries = self._entries(first, out)
-        bits, coefficients = len(self.coefficients), 0
-        if bits:
-            coefficients = room(1 << bits)
+            out.add("nodes", (_KINDS[type(form)], flags, lo, hi, *sizes, *places))
+        entries, bits = self._entries(first, out), len(self.coefficients)
+        coefficients = room(1 << bits) if bits else 0
         neutral = sum(1 << i for i, (index, _) in enumerate(self.coefficients) if self.nodes[index].dual)
         steps = sum(not node.endless for node in self.nodes)
         leaves = sum(isinstance(node.form, ir.Predicate) for node in self.nodes)
         shape = (first, first + leaves, first + steps, len(self.nodes), first + self.root, self.lag, self.far)
-        out.graphs.append(
-            (
-                *shape,
-                sum(node.foreseen for node in self.nodes),
-                coefficients,
-                bits,
-                neutral,
-                len(out.entries),
-                len(entries),
-                out.room("spans", spans * (1 + cut)),
-                spans,
-                out.room("ints", ints * (1 + cut)),
-                ints,
-            )
-        )
-        out.entries += entries
+        to_end = (coefficients, bits, neutral, out.add("entries", *entries), len(entries))
         if len(entries) > _ENTRIES:
             raise Untranslatable("too many operators around windows to the end")
-        return len(out.graphs) - 1
+        state = (out.room("spans", spans * (1 + cut)), spans, out.room("ints", ints * (1 + cut)), ints)
+        return out.add("graphs", (*shape, sum(node.foreseen for node in self.nodes), *to_end, *state))
 
-    def _entries(self, first: int, out: _Tables) -> list[Row]:
+    def _entries(self, first: int, out: Streams) -> list[Row]:
         """Parts of a formula with windows to the end, operands first."""
         entries: list[Row] = []
         for (index, later), args in self.skeleton.items():
             node = self.nodes[index]
             if not node.endless:
-                operands = out.add(out.operands, [self._read(first, index, self.lag - later)])
+                operands = out.add("operands", self._read(first, index, self.lag - later))
                 entries.append((_KINDS[ir.Predicate], 0, operands, 1, later, 0))
                 continue
-            own = [(first + index, 0, 0, 0)] if node.ends else []
-            operands = out.add(out.operands, [(arg, 0, 0, 0) for arg in args] + own)
+            own = [first + index] if node.ends else []
+            operands = out.add("operands", *((arg, 0, 0, 0) for arg in [*args, *own]))
             flags = _WEAK * getattr(node.form, "weak", False) | _DUAL * node.dual
             bit = self.coefficients.index((index, later)) if node.ends else 0
             there = later + getattr(node.form, "steps", 0)
             entries.append((_KINDS[type(node.form)], flags, operands, len(args), there, bit))
         return entries
 
-    def predicates(self, number: int) -> Lines:
+    def predicates(self, number: int) -> str:
         """Function that writes the values of the predicates."""
-        found = [
-            line
-            for node in self.nodes
-            if isinstance(node.form, ir.Predicate)
-            for line in self._predicate(node)
-        ]
-        head = f"static void predicates_{number}(const samples *x, at n, int mode, int clip, span *v) {{"
-        return [
-            head,
-            "  (void)x; (void)n; (void)mode; (void)clip; (void)v;",
-            *(f"  {line}" for line in found),
-            "}",
-        ]
+        return f"""\
+static void predicates_{number}(const samples *x, at n, int mode, int clip, span *v) {{
+  (void)x; (void)n; (void)mode; (void)clip; (void)v;
+{"".join(self._predicate(node, node.form) for node in self.nodes if isinstance(node.form, ir.Predicate))}}}
+"""
 
-    def _predicate(self, node: Node) -> Lines:
-        atom = node.form
-        assert isinstance(atom, ir.Predicate)
+    def _predicate(self, node: Node, atom: ir.Predicate) -> str:
         near, far = atom.num.reach, atom.num.farthest
 
         def place(leaf: Leaf) -> str | None:
@@ -407,39 +378,31 @@ class Graph:
             return f"X({column}, {instant})"
 
         reads = {place(leaf) for leaf in atom.num.leaves() if isinstance(leaf, (ir.Signal, ir.ShiftedSignal))}
-        known = (
-            " && ".join(f"{text} == {text}" for text in sorted(filter(None, reads)) if text != "(real)t")
-            or "1"
-        )
+        known = " && ".join(f"{text} == {text}" for text in sorted(filter(None, reads - {"(real)t"}))) or "1"
         sides = []
         for least in (True, False):
-            writer = NumberWriter(place)
-            bounded = unsure(atom, frozenset(), least=least)
+            writer, bounded = NumberWriter(place), unsure(atom, frozenset(), least=least)
             assert isinstance(bounded, ir.Predicate)
             value = writer.number(bounded.num) if atom.sign > 0 else f"-{writer.number(bounded.num)}"
             if atom.guard:
                 value = f"{value} {'>' if atom.strict else '>='} 0 ? INF : -INF"
             sides.append([*writer.lines, f"out.{'lo' if least else 'hi'} = {value};"])
-        if sides[0][:-1] == sides[1][:-1]:
-            body = [*sides[0], sides[1][-1]]
-        else:
-            body = ["{", *sides[0], "}", "{", *sides[1], "}"]
-        outside = 1 if atom.sign < 0 else 0
-        rows = _ring(node.kept + 1)
-        return [
-            f"if (n >= {node.delay}) {{",
-            f"  const at t = n - {node.delay};",
-            "  span out = spanned(-INF, INF);",
-            f"  if (t >= {near.past} && t + (mode >= ENDED ? {near.future} : {far.future}) < x->known) {{",
-            f"    if ({known}) {{",
-            *(f"      {line}" for line in body),
-            "    }",
-            "  } else if (clip) {",
-            f"    out = certain({outside});",
-            "  }",
-            f"  v[{self.rings[node.index]} + (t & {rows - 1})] = out;",
-            "}",
-        ]
+        (*first, low), (*second, high) = sides
+        body = [*first, low, high] if first == second else ["{", *first, low, "}", "{", *second, high, "}"]
+        values = "".join(f"        {line}\n" for line in body)
+        return f"""\
+  if (n >= {node.delay}) {{
+    const at t = n - {node.delay};
+    span out = spanned(-INF, INF);
+    if (t >= {near.past} && t + (mode >= ENDED ? {near.future} : {far.future}) < x->known) {{
+      if ({known}) {{
+{values}      }}
+    }} else if (clip) {{
+      out = certain({int(atom.sign < 0)});
+    }}
+    v[{self.rings[node.index]} + (t & {_ring(node.kept + 1) - 1})] = out;
+  }}
+"""
 
 
 _DUAL, _WEAK, _UNCUT, _ENDLESS, _LASTS, _ROOT, _AHEAD = 1, 2, 4, 8, 16, 32, 64
@@ -461,29 +424,6 @@ _KINDS: dict[type, int] = {
 Row: TypeAlias = tuple[Any, ...]
 
 
-@dataclass(slots=True)
-class _Tables:
-    """Tables of a monitor, and the sizes of its state."""
-
-    nodes: list[Row] = field(default_factory=list)
-    operands: list[Row] = field(default_factory=list)
-    readers: list[Row] = field(default_factory=list)
-    entries: list[Row] = field(default_factory=list)
-    graphs: list[Row] = field(default_factory=list)
-    rules: list[Row] = field(default_factory=list)
-    sizes: Counter[str] = field(default_factory=Counter)
-
-    def add(self, table: list[Row], rows: Sequence[Row]) -> int:
-        """Add rows to a table; return the number of the first."""
-        table += rows
-        return len(table) - len(rows)
-
-    def room(self, part: str, count: int) -> int:
-        """Reserve `count` places of a part of the state; return the first."""
-        self.sizes[part] += count
-        return self.sizes[part] - count
-
-
 TABLES = {
     "node": "nodes",
     "operand": "operands",
@@ -493,6 +433,9 @@ TABLES = {
     "rule": "rules",
 }
 """C type of a row -> name of the table."""
+
+SIZES = ("signals", "rows", "judged", "spans", "times", "ints", "truths")
+"""Last members of the structure `tables`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -510,19 +453,29 @@ class Rule:
     lag: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Streams:
     """Program of a monitor of streams.
 
     Attributes:
         tables: C name of a table -> its rows, all numbers int32.
-        sizes: `signals`, `rows`, `judged`, `spans`, `times`, `ints` and `truths` of the structure `tables`.
+        sizes: name of a size of the structure `tables` -> its value.
         predicates: C text of the function `predicates`, after the types.
     """
 
-    tables: Mapping[str, Sequence[Row]]
-    sizes: Mapping[str, int]
-    predicates: str
+    tables: dict[str, list[Row]] = field(default_factory=lambda: {name: [] for name in TABLES.values()})
+    sizes: Counter[str] = field(default_factory=lambda: Counter(dict.fromkeys(SIZES, 0)))
+    predicates: str = ""
+
+    def add(self, table: str, *rows: Row) -> int:
+        """Add rows to a table; return the number of the first."""
+        self.tables[table] += rows
+        return len(self.tables[table]) - len(rows)
+
+    def room(self, part: str, count: int) -> int:
+        """Reserve `count` places of a part of the state; return the first."""
+        self.sizes[part] += count
+        return self.sizes[part] - count
 
 
 def streams_of(rules: Sequence[Rule], signals: Sequence[str], *, cut: bool) -> Streams:
@@ -533,14 +486,14 @@ def streams_of(rules: Sequence[Rule], signals: Sequence[str], *, cut: bool) -> S
     Raises:
         Untranslatable: a formula has no transducers.
     """
-    index = {name: i for i, name in enumerate(signals)}
-    out, bodies, rows = _Tables(), [], 1
+    index, out, texts, calls = {name: i for i, name in enumerate(signals)}, Streams(), [], []
+    out.sizes["signals"], out.sizes["rows"], out.sizes["judged"] = len(signals), 1, len(rules)
 
     def added(graph: Graph) -> int:
-        nonlocal rows
         number = graph.tables(out, cut=cut)
-        bodies.append(graph.predicates(number))
-        rows = max(rows, graph.samples)
+        texts.append(graph.predicates(number))
+        calls.append(f"  case {number}: predicates_{number}(x, n, mode, clip, v); return;\n")
+        out.sizes["rows"] = max(out.sizes["rows"], _ring(graph.samples))
         return number
 
     for rule in rules:
@@ -551,24 +504,19 @@ def streams_of(rules: Sequence[Rule], signals: Sequence[str], *, cut: bool) -> S
         truths = added(deciding)
         numbers = (truths if values is deciding else added(values), truths)
         root = deciding.nodes[deciding.root].rows
-        out.rules.append((*numbers, out.room("ints", root), root - 1))
+        out.add("rules", (*numbers, out.room("ints", root), root - 1))
     if any(size >= _LARGEST for size in out.sizes.values()):
         raise Untranslatable("windows of more samples than memory holds")
-    sizes = {"signals": len(signals), "rows": _ring(rows), "judged": len(rules)}
-    sizes |= {part: out.sizes[part] for part in ("spans", "times", "ints", "truths")}
-    calls = [f"  case {i}: predicates_{i}(x, n, mode, clip, v); return;" for i in range(len(bodies))]
-    text = [
-        f"#define X(i, q) x->x[(i) * {_ring(rows)} + ((q) & {_ring(rows) - 1})]",
-        *(line for body in bodies for line in body),
-        "API void predicates(int32_t g, const samples *x, at n, int mode, int clip, span *v) {",
-        "  switch (g) {",
-        *calls,
-        "  default: return;",
-        "  }",
-        "}",
-        "",
-    ]
-    return Streams({name: getattr(out, name) for name in TABLES.values()}, sizes, "\n".join(text))
+    stored = out.sizes["rows"]
+    out.predicates = f"""\
+#define X(i, q) x->x[(i) * {stored} + ((q) & {stored - 1})]
+{"".join(texts)}API void predicates(int32_t g, const samples *x, at n, int mode, int clip, span *v) {{
+  switch (g) {{
+{"".join(calls)}  default: return;
+  }}
+}}
+"""
+    return out
 
 
 def runtime() -> tuple[str, str]:
