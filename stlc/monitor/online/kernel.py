@@ -163,10 +163,10 @@ class Streamed:
     @property
     def tally(self) -> RequirementSummary:
         """Summary of the counted starts."""
-        counts, bounds, kernel = np.zeros(5, dtype=np.int64), np.zeros(6), self.kernel
-        kernel.library.stlc_tally(kernel.at, self.number, counts.ctypes.data, bounds.ctypes.data)
-        instants, holds, fails, low_at, high_at = counts.tolist()
-        low, high, least, most, *_ = bounds.tolist()
+        counts, bounds, kernel = (ctypes.c_int64 * 5)(), (ctypes.c_double * 6)(), self.kernel
+        kernel.library.stlc_tally(kernel.at, self.number, counts, bounds)
+        instants, holds, fails, low_at, high_at = counts
+        low, high, least, most, *_ = bounds
         found = (instants, holds, fails, low_at, high_at, low, high, (least, most), self.asked.begin)
         return RequirementSummary(*found)
 

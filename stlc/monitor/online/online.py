@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
@@ -292,10 +293,8 @@ class Online:
         watched = self._find(name)
         tally = watched.tally
         judged = watched.judged(watched.asked.starts(tally.next, self.samples))
-        ends, until = np.array((judged.low, judged.high)), tally.with_more(judged)
-        if tally.instants:
-            ends = np.c_[ends, tally.last]
-        low, high = ends.min(1).tolist()
+        until, ends = tally.with_more(judged), zip(tally.last, (judged.low, judged.high), strict=True)
+        low, high = (min(last, float(end.min(initial=math.inf))) for last, end in ends)
         return Margin(until.status, low, high, until.fails)
 
     def standing(self, name: str) -> RequirementSummary:

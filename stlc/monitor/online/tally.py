@@ -89,7 +89,7 @@ class RequirementSummary:
         low: minimum over the instants of the least robustness over all continuations; +inf if there are no
             instants.
         high: minimum over the instants of the greatest robustness over all continuations.
-        last: bounds on the robustness at the instant that was counted last.
+        last: bounds on the robustness at the instant that was counted last; +inf if there are no instants.
         first: the first counted instant.
     """
 
@@ -100,7 +100,7 @@ class RequirementSummary:
     high_at: int = 0
     low: float = math.inf
     high: float = math.inf
-    last: tuple[float, float] = (-math.inf, math.inf)
+    last: tuple[float, float] = (math.inf, math.inf)
     first: int = 0
 
     def with_more(self, judged: JudgedInstants, count: int | None = None) -> RequirementSummary:
@@ -109,12 +109,13 @@ class RequirementSummary:
         if not len(low):
             return self
         least, low_at, most, high_at = self.low, self.low_at, self.high, self.high_at
-        if low.min() < least:
-            least, low_at = float(low.min()), self.next + int(low.argmin())
-        if high.min() < most:
-            most, high_at = float(high.min()), self.next + int(high.argmin())
+        if (lowest := float(low[at := int(low.argmin())])) < least:
+            least, low_at = lowest, self.next + at
+        if (lowest := float(high[at := int(high.argmin())])) < most:
+            most, high_at = lowest, self.next + at
         last = float(low[-1]), float(high[-1])
-        counts = self.instants + len(low), self.holds + int(holds.sum()), self.fails + int(fails.sum())
+        known = int(np.count_nonzero(holds)), int(np.count_nonzero(fails))
+        counts = self.instants + len(low), self.holds + known[0], self.fails + known[1]
         return RequirementSummary(*counts, low_at, high_at, least, most, last, self.first)
 
     @property

@@ -673,6 +673,7 @@ API void stlc_init(monitor *m, int32_t r, int64_t start, int everywhere, int cut
   of->cut = cut;
   of->slack = -tolerance;
   of->sum.low = of->sum.high = INF;
+  of->last[0] = of->last[1] = certain(1);
 }
 
 /* Take a sample; return how many starts it decides. */
