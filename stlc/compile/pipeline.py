@@ -257,7 +257,7 @@ def compile_resolved(
     timers = stage.table.timers
     read = frozenset().union(*(rule.formula.columns for rule in (*requirements, *assumptions)))
     signature = Signature(tuple(column for column in spec.signature.columns if column.name in read))
-    counted = (int(timer.high) for timer in timers if timer.kind == "timer")  # greatest numbers of steps
+    counted = (int(timer.high) for timer in timers if timer.kind == "timer")  # steps, at most
     return Compiled(
         name=spec.name,
         spec=spec.source_ast,

@@ -77,9 +77,11 @@ def _leaf(leaf: GoalLeaf) -> _Guidance | None:
     The goal is an absolute formula: its interval counts from the start of the mission. The deadline of
     `eventually@` and `until@` is the end of the interval. The deadline of `always@` is the start of the
     interval. The violation is 0 once the formula is true or false, or once the interval of `always@` has
-    begun. A recurring goal is `always@[a, end] once[0, c] p`, or a conjunction such as
-    `always@[a, end] (once[0, c] p and once[0, d] q)`. Its deadline is another: that of `once[0, c] p` is c
-    after the last sample at which p held.
+    begun.
+
+    A recurring goal is `always@[a, end] once[0, c] p`, or a conjunction such as
+    `always@[a, end] (once[0, c] p and once[0, d] q)`. The deadline of `once[0, c] p` is c after the last
+    sample at which p held.
     """
     formula, window, status = leaf.formula, leaf.formula.window, leaf.status
     if formula.op == "always" and window.hi is None and status is not None:

@@ -139,8 +139,8 @@ def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
     over: ir.Formula = ir.Truth(False)
     if window.hi is not None:
         end = ir.Const(float(window.hi))
-        not_over, over = at_least(end, clock), at_least(clock, end)
-        inside = not_over if window.lo == 0 else both(inside, not_over)
+        until_end, over = at_least(end, clock), at_least(clock, end)  # both hold at the end
+        inside = until_end if window.lo == 0 else both(inside, until_end)
     match formula.op:
         case "always":
             return choose(both(inside, right.negated), _FALSE, choose(over, _TRUE, _OPEN))

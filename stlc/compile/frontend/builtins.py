@@ -229,11 +229,11 @@ def _shifted(value: Value, delay: typed.Time, expr: ast.Expr, span: Span, name: 
         case Number() if value.kind != "bool":
             return replace(value, num=_delayed_number(value.num, delay), origin=None)
         case VectorValue(items):
-            shifted = []
+            moved = []
             for item in items:  # a number such as `if c then p else q`, with bools p and q, has a formula too
                 formula = None if item.formula is None else _delayed_formula(item.formula, delay, span)
-                shifted.append(replace(item, num=_delayed_number(item.num, delay), formula=formula))
-            return VectorValue(tuple(shifted), span=span)
+                moved.append(replace(item, num=_delayed_number(item.num, delay), formula=formula))
+            return VectorValue(tuple(moved), span=span)
         case _:
             return _delayed_formula(as_formula(value, expr, Expectation(name), scope), delay, span)
 
@@ -315,7 +315,7 @@ def outside(entry: External, call: ast.Call, values: Sequence[Value], scope: Sco
     """Return the value of a call of a function that the system provides.
 
     Raises:
-        Failed: wrong arguments (E105), or arguments of a wrong type (E202, E205).
+        Failed: wrong arguments (E105), or arguments of a wrong type (E202, E205) or unit (E203).
     """
     _positional(entry.name, call, scope, "give its arguments in order")
     count_arguments(entry.name, call, len(entry.arguments), len(entry.arguments), scope)

@@ -37,7 +37,8 @@ def as_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> 
     """Return a value as a number; a member of an enum becomes the number that stands for the member.
 
     Raises:
-        Failed: the value is a formula or a bool (E202), or anything else that is not a number (E205).
+        Failed: the value is a formula or a bool (E202), a time that is known only in an interval (E311),
+            or anything else that is not a number (E205).
     """
     match value:
         case Number(kind="bool"):

@@ -487,9 +487,9 @@ class _EntryBuilder:
         else:
             (entry,) = column_entries(columns, about=about, span=item.name_span).values()
         value = entry.value
-        if unit.text and isinstance(value, VectorValue):  # the system may store it in another unit
-            items = tuple(rebased(item, unit) for item in value.items)
-            return replace(entry, value=replace(value, items=items))
+        if unit.text and isinstance(value, VectorValue):  # the system may store the signal in another unit
+            parts = tuple(rebased(part, unit) for part in value.items)
+            return replace(entry, value=replace(value, items=parts))
         if unit.text and isinstance(value, Number):
             return replace(entry, value=rebased(value, unit))
         return entry

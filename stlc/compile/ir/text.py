@@ -39,9 +39,10 @@ def show_formula(formula: ir.Formula) -> str:
             window, end = formula.window, "start" if formula.back else "end"
             op = f"{formula.op}[{window.lo}..{end if window.hi is None else window.hi}]"
             return " ".join([*before, op, last])
+        case ir.BoolOp(op):
+            return f" {op} ".join(map(_operand, _parts(formula)))
         case _:
-            joined: Any = formula
-            return f" {joined.op} ".join(map(_operand, _parts(formula)))
+            raise TypeError(type(formula).__name__)
 
 
 def _operand(formula: ir.Formula) -> str:

@@ -123,7 +123,7 @@ class Freezer:
         most, width = _MOST // batch, back + ahead
         if math.isinf(width):  # each instant has a copy of the whole trace
             size = most // self.domain.samples
-        else:  # the copies of `size` instants have size * (size + width) samples, at most `most`
+        else:  # `size` instants have copies of size + width samples each: at most `most` in total
             size = int((math.sqrt(width * width + 4.0 * most) - width) / 2.0)
         for chunk in _chunks(run, max(size, 1)):
             start = max(chunk.start - back, 0)

@@ -208,10 +208,10 @@ class _Planner(Scheduler):
 
         If there is no such step yet, it is added, outside of all loops on which its value does not depend.
         """
-        node, depth = _split(node), 0  # depth: of the innermost enclosing loop on which the value depends
-        if len(self.scopes) > 1:
+        node, depth = _split(node), 0
+        if len(self.scopes) > 1:  # depth of the innermost enclosing loop on which the value depends
             read = _frozen_names(node)
-            depth = max((depth for depth, scope in enumerate(self.scopes) if read & scope.read), default=0)
+            depth = max((i for i, scope in enumerate(self.scopes) if read & scope.read), default=0)
         around = self.scopes[depth + 1 :]
         if not around:
             return super().place(node, run)

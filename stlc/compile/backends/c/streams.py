@@ -407,6 +407,7 @@ static void predicates_{number}(const samples *x, at n, int mode, int clip, span
 
 _DUAL, _WEAK, _UNCUT, _ENDLESS, _LASTS, _ROOT, _AHEAD = 1, 2, 4, 8, 16, 32, 64
 _TRUTHS = {None: 0, False: 1, True: 2}
+"""Truth, None if it is unknown -> its number in `streams.c`."""
 _KINDS: dict[type, int] = {
     ir.Truth: 0,
     ir.Predicate: 1,

@@ -175,8 +175,8 @@ def _run(
 ) -> tuple[Tensor, ...]:
     """Run the kernel on `arrays`; return the arrays of `rows` rows that it fills."""
     operands = kernel.operands
-    out = []
-    for x in arrays[: operands if direction == "pull" else 1]:  # uninitialized, with the same memory layout
+    out = []  # uninitialized, each with the memory layout of an array in `arrays`
+    for x in arrays[: operands if direction == "pull" else 1]:
         batch = x.shape[1]
         by_column = x.stride(0) == 1 and batch > 1
         out.append(x.new_empty((batch, rows)).T if by_column else x.new_empty((rows, batch)))
