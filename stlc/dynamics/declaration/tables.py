@@ -89,15 +89,16 @@ def _table(entry: Entry, cx: Context) -> TableDecl | None:
     units = _units(keys.of, where, cx)
     if units is None or keys.at is None or keys.values is None:
         return None
+    called = f"`at` of {where}"
     if len(units) == 1:
-        points: tuple[Row, ...] = (_row(keys.at, units[0], f"`at` of {where}", cx),)
+        points: tuple[Row, ...] = (_row(keys.at, units[0], called, cx),)
         rows: tuple[Node, ...] = (keys.values,)
     else:
-        at = cx.reader.items(keys.at, f"`at` of {where}")
+        at = cx.reader.items(keys.at, called)
         if len(at) == len(units):
-            points = tuple(_row(*each, f"`at` of {where}", cx) for each in zip(at, units, strict=True))
+            points = tuple(_row(item, unit, called, cx) for item, unit in zip(at, units, strict=True))
         else:
-            cx.reader.wrong(keys.at, f"`at` of {where}", f"{len(units)} lists of numbers, one per argument")
+            cx.reader.wrong(keys.at, called, f"{len(units)} lists of numbers, one per argument")
             points = ((),) * len(units)
         rows = cx.reader.items(keys.values, f"`values` of {where}")
     numbers = tuple(_numbers(row, keys.unit, f"`values` of {where}", cx) for row in rows)

@@ -34,7 +34,7 @@ def _along(num: ir.Num, slopes: Mapping[str, ir.Num]) -> ir.Num | None:
             return slopes.get(name)
         case ir.Where(cond, yes, no):
             return _choice(cond, _along(yes, slopes), _along(no, slopes))
-        case ir.Op("min" | "max" as name, (best, *rest)):  # that of the first argument that is extreme
+        case ir.Op("min" | "max" as name, (best, *rest)):  # derivative of the first extreme argument
             found = _along(best, slopes)
             for arg in rest:
                 gap = best - arg if name == "max" else arg - best

@@ -200,9 +200,9 @@ def _draw(sampler: str, args: list[Tensor], rows: Rows) -> Tensor:
 
 
 def _in_tail(first: Tensor, last: Tensor, share: Tensor) -> Tensor:
-    """Truncated normal numbers where both ends are far on one side; only logarithms hold their probabilities.
+    """Standard normal numbers from `first` to `last`, at the given shares of the probability between them.
 
-    `share`: share of the probability between the ends that is below the number.
+    Both ends are far on one side, where only logarithms hold the probabilities.
     """
     one, other = first.abs(), last.abs()
     near, end = torch.minimum(one, other), torch.maximum(one, other)

@@ -98,8 +98,9 @@ def _flow(decl: SystemDecl, writer: Assignments, state: State, given: State) -> 
 def _jump(jump: JumpDecl, given: State, state: State, *, soft: bool) -> State:
     """Return the states after one jump; `state` is the result of the flow and of earlier jumps.
 
-    If `soft`, the jump is a differentiable blend by the smooth indicator I_w of Eq. 6, which is exactly the
-    one or the other where I_w is 1 or 0. Otherwise it is an exact choice. `given` are the actuator commands.
+    If `soft`, the result is a differentiable blend of the states with and without the jump, weighted by the
+    smooth indicator I_w of Eq. 6; where I_w is 1 or 0, it is exactly one of them. Otherwise it is an exact
+    choice. `given` are the actuator commands.
     """
     changed, guard = dict(state), jump.guard.substitute(given)
     for assign in jump.resets:
