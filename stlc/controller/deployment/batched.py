@@ -202,7 +202,7 @@ class Worlds:
         with self.drawing():
             acted = self.disturbance.acted(self.system.commanded(x, action).clone())
         acts = torch.split(self.system.planned(x, acted), self.parts)
-        if all(truth is self.truths[0] for truth in self.truths):
+        if all(truth is self.truths[0] for truth in self.truths):  # one step for all seeds
             alone = self.truths[0].step(torch.cat(before), torch.cat(acts))
         else:
             rows = zip(self.truths, before, acts, strict=True)

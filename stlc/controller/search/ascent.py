@@ -132,10 +132,10 @@ class GradientAscent:
         `x`: states, (agents, n). `rate`: initial step size. `until`: deadline.
 
         Returns:
-            The best plans, (agents, KEPT, T, m), and their values, (agents, KEPT), best first. If a plan
-            satisfies the specification, its value is its robustness plus the large number `APART`. If it is
-            only safe, it is the robustness alone. If it is unsafe, it is the robustness of the safety
-            requirements minus `APART`.
+            The best plans, (agents, KEPT, T, m), and their values, (agents, KEPT), best first. The value of
+            a plan that satisfies the specification is its robustness plus the large number `APART`; of one
+            that is only safe, its robustness; of an unsafe one, the robustness of the safety requirements
+            minus `APART`.
         """
         agents, count = plans.shape[:2]
         starts, rows = np.repeat(x, count, 0), plans.reshape(-1, *plans.shape[2:])

@@ -318,7 +318,11 @@ class _TorchSearch:
         found.rho[rows] = value[better]
 
     def _proposals(self, plans: Tensor, tries: int, library: Tensor) -> Tensor:
-        """Randomly changed copies of plans, within the control bounds: (B, T, m) -> (B, tries, T, m)."""
+        """Random plans within the control bounds: (B, T, m) -> (B, tries, T, m).
+
+        Three quarters are changed copies of `plans`. The others are taken from `library`, or are piecewise
+        constant if the library holds few plans.
+        """
         quarter = tries // 4
         span = self.high - self.low
         start = plans[:, None]
@@ -333,8 +337,8 @@ class _TorchSearch:
             others = library[self._randint(0, library.shape[0], states, count)]
         else:
             pieces = 4
-            level = self.low + span * self._rand(states, count, pieces, controls)
-            others = level.repeat_interleave(-(-steps // pieces), 2)[:, :, :steps]
+            levels = self.low + span * self._rand(states, count, pieces, controls)
+            others = levels.repeat_interleave(-(-steps // pieces), 2)[:, :, :steps]
         return torch.cat((noise, shift, held, others), 1).clamp(self.low, self.high)
 
     def _stretch(self, shape: tuple[int, ...]) -> Tensor:

@@ -192,7 +192,7 @@ class GaussNewton:
         curve = np.einsum("bcki,bckj,bck->kbij", rows, rows, weight, optimize=True)
         pull = -np.einsum("bcki,bck->kbi", rows, weight * rest)
         by_state, by_control = self._jacobians(now)
-        effects = by_control @ by_control.swapaxes(2, 3)  # of all controls before a sample, squared
+        effects = by_control @ by_control.swapaxes(2, 3)  # squared, of the controls before each sample
         for k in range(1, len(effects)):
             effects[k] += by_state[k] @ effects[k - 1] @ by_state[k].swapaxes(1, 2)
         effect = np.nan_to_num(np.einsum("kbij,kbij->b", effects, curve[1:]), nan=1.0, posinf=1e12)

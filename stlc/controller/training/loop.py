@@ -452,6 +452,7 @@ class _Session:
         learner, saved = self.learner, time.perf_counter()
         while more := self._goes_on():
             patience = max(BARREN_VALIDATIONS * learner.config.every, BARREN_SHARE * learner.steps)
+            # Further search is useless if bounds prove that no plan exists, or the longest search found none.
             useless = bool(self.refuted) or (self.exhausted and learner.step >= patience)
             if self.barren and learner.searches and useless:  # no satisfying plan was ever found
                 break

@@ -251,7 +251,7 @@ class Phases:
                 found = self._phase(row, plans[int(rho.argmax())])
         if found.margin >= -UNSURE:
             row, plan = self._row(state, replace(request, last=found.sample)), found.plan
-            for control, level in enumerate(self._middle):  # it is held there unless it is needed
+            for control, level in enumerate(self._middle):  # a control that is not needed is held there
                 calmer = np.where(np.arange(len(self._middle)) == control, level, plan)
                 if self._judged(row, calmer[None])[0] >= found.margin:
                     plan = calmer
