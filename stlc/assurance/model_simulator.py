@@ -68,7 +68,7 @@ class ModelSimulator:
         @cache
         def finer(sampled: bool) -> Task:
             halved = {"time.dt": f"{decl.dt / 2} s", "time.horizon": f"{2 * decl.horizon} steps"}
-            if sampled:  # what is computed or counted at samples keeps its period: a shorter step within it
+            if sampled:  # what is computed or counted at samples keeps its period
                 halved = {"time.substeps": str(2 * decl.substeps)}
             return Task.load(spec, system, {**overrides, **halved})
 

@@ -129,7 +129,7 @@ def narrowed(
                     proved.append(known)
                     continue
                 effects = known
-            for axis in np.argsort(-effects)[:axes]:
+            for axis in np.argsort(-effects)[:axes]:  # halve the box in the coordinates that matter most
                 low, high = box.split(int(axis))
                 box, other = (high, low) if states[i, axis] >= box.centre[axis] else (low, high)
                 if others is not None:

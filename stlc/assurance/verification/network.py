@@ -201,7 +201,8 @@ class PlanBounds:
         first = len(raw.generators)
         outputs = [each.with_symbol(first + i) for i, each in enumerate(columns(raw))]
         half, middle = 0.5 * (self._high - self._low), 0.5 * (self._high + self._low)
-        error = 16.0 * UNIT * (np.abs(middle) + half)  # functions within 4 units of the last place; the map
+        # The functions are exact within 4 units of the last place; the rest is for the map.
+        error = 16.0 * UNIT * (np.abs(middle) + half)
         plan = []
         for step in range(self._steps):
             at = self._width * min(begun + step, self._steps - 1)
