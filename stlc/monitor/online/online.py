@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
@@ -289,12 +288,12 @@ class Online:
         return float(judged.low[0]), float(judged.high[0])
 
     def margin(self, name: str) -> Margin:
-        """Robustness margin of the requirement `name` at the latest sample, of which there is one."""
+        """Robustness margin of the requirement `name` at the latest sample; +inf before the first start."""
         watched = self._find(name)
         tally = watched.tally
         judged = watched.judged(watched.asked.starts(tally.next, self.samples))
         until, ends = tally.with_more(judged), zip(tally.last, (judged.low, judged.high), strict=True)
-        low, high = (min(last, float(end.min(initial=math.inf))) for last, end in ends)
+        low, high = (float(end.min(initial=last)) for last, end in ends)  # a NaN stays
         return Margin(until.status, low, high, until.fails)
 
     def standing(self, name: str) -> RequirementSummary:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.instants import rule_bounds
-from stlc.monitor.online.online import Margin
+from stlc.monitor.online.online import How, Margin
 from stlc.monitor.online.recompute import GrowingBounds
 from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
@@ -95,3 +95,21 @@ def test_a_requirement_of_nothing_has_a_margin() -> None:
     online = Monitor("signal x\nrequire a: true", dt=1, horizon=4).online()
     online.push_block(np.zeros((1, 0)))
     assert online.margin("a") == Margin("satisfied", np.inf, np.inf, 0)
+
+
+@pytest.mark.parametrize("condition", ["x * x - y * y > 0", "x * x - y * y > 0 or freeze z = x in x < z"])
+def test_a_margin_that_is_no_number_is_shown_as_such(condition: str) -> None:
+    online = Monitor(f"signal x, y\nrequire a: always[3, 5] ({condition})", dt=1).online(How("all"))
+    online.push_block([(1.0, 1.0), (1.0, 1.0), (1.0, 1.0), (1e300, 1e300)])
+    margin = online.margin("a")
+    assert (margin.status, margin.violated) == ("inconclusive", 0)
+    assert np.isnan([margin.low, margin.high]).all()
+
+
+def test_before_its_first_start_a_requirement_has_no_bounds() -> None:
+    online = Monitor("signal x\nrequire a: x > 0\nrequire b: freeze z = x in x >= z", dt=1).online(How(2))
+    for samples in range(2):
+        assert online.samples == samples
+        for name in online.requirements:
+            assert online.margin(name) == Margin("inconclusive", np.inf, np.inf, 0)
+        online.push([1.0])
