@@ -192,7 +192,8 @@ class LiveView:
         monitor, moment = self.monitor, self.monitor.moment
         assert moment is not None
         agents = range(monitor.setting.agents)
-        least = [min(each.high for each in found) for found in zip(*monitor.margins.values(), strict=True)]
+        margins = monitor.margins
+        least = [min(each.high for each in found) for found in zip(*margins.values(), strict=True)]
         rows = sorted(sorted(agents, key=least.__getitem__)[:most])
         states = moment.x[: len(agents)].tolist()
         names = monitor.task.system.signature.columns
@@ -200,7 +201,7 @@ class LiveView:
         cells = []
         for row in rows:
             rho = "" if decision is None else _signed(float(decision.rho[row]))
-            name = next(name for name, found in monitor.margins.items() if found[row].high == least[row])
+            name = min(margins, key=lambda name: margins[name][row].high)
             first = (str(row), monitor.decided(row) or "", rho, f"{name} {_signed(least[row])}")
             cells.append([*first, *map(_shown, names, states[row])])
         units = (f"{column.name} {column.unit.text}".strip() for column in names)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -22,6 +24,7 @@ from stlc.controller.world import world_type
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
 from stlc.grammar.spec import Spec
+from stlc.monitor.online.online import Margin
 from stlc.signature import Column
 from stlc.source import Source
 
@@ -123,6 +126,22 @@ def test_of_more_agents_than_fit_the_worst_are_shown() -> None:
     rows = [line.split() for line in last if line.strip() and line.split()[0].isdigit()]
     assert 3 <= len(rows) < 6
     assert [row[0] for row in rows] == sorted(row[0] for row in rows)
+
+
+def test_an_agent_has_a_row_although_its_margin_is_no_number() -> None:
+    margins = {
+        "a": [Margin("inconclusive", math.nan, math.nan, 0)],
+        "b": [Margin("satisfied", 1.0, 1.0, 0)],
+    }
+    monitor = SimpleNamespace(
+        margins=margins,
+        setting=SimpleNamespace(agents=1),
+        moment=SimpleNamespace(x=torch.zeros((1, 0)), decision=None),
+        task=SimpleNamespace(system=SimpleNamespace(signature=SimpleNamespace(columns=()))),
+        decided=lambda _: None,
+    )
+    view = LiveView(monitor, "", Console(file=io.StringIO()))  # type: ignore[arg-type]
+    assert view._agents(80, 3)[1].plain.split() == ["0", "a", "+nan"]
 
 
 def test_little_room_takes_from_bars() -> None:
