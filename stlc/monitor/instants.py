@@ -89,7 +89,7 @@ def rule_bounds(
 def live_bounds(
     rule: CompiledRequirement, record: Record, starts: range, horizon: int | None, ends: Ends
 ) -> tuple[Array, Array]:
-    """`rule_bounds` of a trace that may go on after its last sample, and end with any."""
+    """`rule_bounds` of a trace that may go on; the bounds hold wherever it ends."""
     window, cut, parts = window_of(rule, horizon), ends == "truncate", []
     settled = max(record.samples - span_of(rule, horizon).future, starts.start) if cut else starts.start
     if known := range(starts.start, min(settled, starts.stop)):

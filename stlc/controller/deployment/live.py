@@ -71,7 +71,7 @@ class LiveMonitor:
 
     @property
     def margins(self) -> dict[str, list[Margin]]:
-        """Name of a requirement -> its margin for each agent; at least one sample must be known."""
+        """Name of a requirement -> its margin for each agent at the latest step; {} before the first step."""
         if self._states:
             states = np.stack(self._states, axis=1, dtype=np.float64)  # (agents, samples, states)
             self._states.clear()

@@ -43,7 +43,7 @@ def show(found: PlantSimulation, spec: str, overrides: Mapping[str, str]) -> Non
     if found.trace is not None:
         say(f"the traces are in {found.trace}")
         words: list[str] = []
-        if not found.trace.endswith(CARRYING):  # then the file of the traces carries the specification
+        if not found.trace.endswith(CARRYING):  # else the file of the traces carries the specification
             for name, value in overrides.items():
                 words += ["--set", f"{name}={value}"]
             words.append(operand(spec))
