@@ -234,8 +234,11 @@ def check_length(rule: CompiledRequirement, samples: int, starts: range, grid: G
     if fits and defined_at(rule.formula, samples, starts):
         return None
     unit, step = ("samples", 1.0) if grid.dt is None else ("s", float(grid.dt))
-    needed, length = (starts.stop - 1 + max(rule.reach, window)) * step, (samples - 1) * step
-    more = f"record {needed - length:.6g} {unit} more, or shorten the intervals"
-    help_ = (more, "`--end truncate` evaluates on what there is")
-    message = f"this needs {needed:.6g} {unit} of signal; the trace has {length:.6g} {unit}"
-    return Diagnostic("E306", message, rule.typed.written.span, help=help_)
+    last = starts.stop - 1 + max(rule.reach, window)
+    needed, length = last * step, (samples - 1) * step
+    help_ = ["`--end truncate` evaluates on what there is"]
+    message = "this reads samples outside the trace, however long it is"
+    if last >= samples and defined_at(rule.formula, last + 1, starts):
+        message = f"this needs {needed:.6g} {unit} of signal; the trace has {length:.6g} {unit}"
+        help_.insert(0, f"record {needed - length:.6g} {unit} more, or shorten the intervals")
+    return Diagnostic("E306", message, rule.typed.written.span, help=tuple(help_))

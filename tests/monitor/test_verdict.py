@@ -258,6 +258,16 @@ def test_a_short_trace_satisfies_violates_or_does_not_say() -> None:
     assert (known.satisfied, known.robustness, known.bounds) == (True, 2.0, (2.0, np.inf))
 
 
+@pytest.mark.parametrize("samples", [1, 2, 9, 60])
+@pytest.mark.parametrize("formula", ["always (a > 0 -> eventually[0 s, 2 s] a > 1)", "prev(a) > 0"])
+def test_no_trace_is_long_enough_for_some_requirements(formula: str, samples: int) -> None:
+    monitor = Monitor(f"signal a\nrequire r: {formula}\n", dt=1)
+    with pytest.raises(TraceError, match=r"E306: this reads samples outside the trace") as caught:
+        monitor.check({"a": np.ones(samples)}, end="strict")
+    (finding,) = caught.value.diagnostics
+    assert finding.help == ("`--end truncate` evaluates on what there is",)
+
+
 def test_strict_and_truncate() -> None:
     monitor = Monitor("signal a\nrequire r: always[0 s, 3 s] a > 0\n", dt=0.5)
     with pytest.raises(TraceError, match=r"E306: this needs 3 s of signal; the trace has 0.5 s") as caught:
