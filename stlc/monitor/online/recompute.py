@@ -7,23 +7,18 @@ whose end moves.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import TypeAlias, final
+from typing import final
 
 import numpy as np
 
 from stlc.compile.backends.schedule import PICKS, neutral
 from stlc.compile.ir import nodes as ir
-from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.tolerance import Status
 from stlc.diagnostics import usage
-from stlc.monitor.instants import live_bounds, rule_bounds, span_of, window_of
+from stlc.monitor.instants import window_of
 from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.tally import Asked, Flags, JudgedInstants, RequirementSummary
-from stlc.monitor.prefix_bounds import FAR
-from stlc.monitor.values import Ends, Record
 
 MOST = 1 << 26
 """Greatest number of values at a time that only one instant reads."""
@@ -37,44 +32,6 @@ _FINAL = 64
 _NARROW = 1 << 13
 """Samples that are evaluated anew after each new one; more of them when an eighth is new."""
 
-Columns: TypeAlias = Mapping[str, Floats]
-"""Signal -> its stored samples, (samples, traces)."""
-
-
-@final
-@dataclass(frozen=True)
-class GrowingBounds:
-    """Bounds on requirements at instants of a growing trace, from samples that include all that they read.
-
-    Attributes:
-        rules: the requirements, which read the same samples.
-        horizon: length of a planning window in steps; None if unknown.
-        ending: whether the end of the trace cuts windows.
-    """
-
-    rules: Sequence[CompiledRequirement]
-    horizon: int | None
-    ending: Ends
-
-    _span = cached_property(lambda self: span_of(self.rules[0], self.horizon))  # asked after each sample
-
-    def settled(self, samples: int) -> int:
-        """The first instant at which a sample after `samples` of them may change the value."""
-        return max(samples - self._span.future, 0)
-
-    def needs(self, start: int) -> int:
-        """The first sample that instants from `start` on read."""
-        return 0 if self._span.future == FAR else max(start - self._span.past, 0)
-
-    def at(self, signals: Columns, starts: range, *, ended: bool = False) -> Floats:
-        """Least and greatest robustness of each requirement in turn, (instants, 2 * requirements).
-
-        The bounds are over all continuations; `ended`: the trace ends with the last sample.
-        """
-        bounds, record = rule_bounds if ended else live_bounds, Record.of(signals)
-        found = (bounds(rule, record, starts, self.horizon, self.ending) for rule in self.rules)
-        return np.concatenate([end for ends in found for end in ends], axis=1)
-
 
 @final
 @dataclass(slots=True)
@@ -82,14 +39,14 @@ class Extremum:
     """Running extremum of `always` or `eventually` to the end of the trace, over instants with final values.
 
     Attributes:
-        body: bounds on the operand.
+        body: the operand, at instants to come.
         lo: first instant of the window, after that of the operator.
         choose: minimum or maximum.
         next: the first instant that is not taken in.
-        known: bounds over the instants that are, (1, 2 * requirements).
+        known: bounds over the instants that are, as of `Asked.bounds`, (1, 2 or 4).
     """
 
-    body: GrowingBounds
+    body: Asked
     lo: int
     choose: np.ufunc
     next: int
@@ -110,7 +67,7 @@ class Extremum:
             inner.append(replace(each, formula=body, lowered=body, reach=body.reach.future))
         choose, lo = np.minimum if node.op == "always" else np.maximum, node.window.lo
         known = np.full((1, 2 * len(inner)), neutral(PICKS[node.op]))
-        return Extremum(GrowingBounds(inner, asked.horizon, "open"), lo, choose, asked.begin + lo, known)
+        return Extremum(replace(asked, rules=inner, ending="open"), lo, choose, asked.begin + lo, known)
 
     @property
     def needs(self) -> int:
@@ -122,7 +79,7 @@ class Extremum:
         stop = self.body.settled(history.samples) - 1
         if stop < self.next + _FINAL:
             return
-        found = self.body.at(history.columns(), range(self.next - history.first, stop - history.first))
+        found = self.body.bounds(history.columns(), range(self.next - history.first, stop - history.first))
         self.known = self.choose(self.choose.reduce(found, axis=0, keepdims=True), self.known)
         self.next = stop
 
@@ -142,7 +99,6 @@ class Recomputed:
     _history: ColumnHistory
     tally: RequirementSummary = field(init=False)
     news: dict[int, Status] = field(default_factory=dict)
-    _values: GrowingBounds = field(init=False)
     _final: Extremum | None = field(init=False)
     _looked: int = 0
     _decided: Flags = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
@@ -151,7 +107,6 @@ class Recomputed:
         asked = self.asked
         _require_bounded(asked)
         self.tally = RequirementSummary(low_at=asked.begin, high_at=asked.begin, first=asked.begin)
-        self._values = GrowingBounds(asked.rules, asked.horizon, asked.ending)
         self._final = Extremum.of(asked)
 
     @property
@@ -173,7 +128,7 @@ class Recomputed:
         new[: len(self._decided)] &= ~self._decided
         for i in np.flatnonzero(new).tolist():
             self.news[starts[i]] = "violated" if judged.fails[i] else "satisfied"
-        settled = min(self._values.settled(samples), samples - self.asked.lag)
+        settled = min(self.asked.settled(samples), samples - self.asked.lag)
         count = min(max(settled - starts.start, 0), len(starts))
         self.tally = self.tally.with_more(judged, count)
         self._decided = known[count:]
@@ -186,7 +141,7 @@ class Recomputed:
         if self._final is not None:
             return self._final.needs
         starts = [*self.news] if self._over else [self.tally.next, *self.news]
-        return min(map(self._values.needs, starts), default=self._history.samples)
+        return min(map(self.asked.needs, starts), default=self._history.samples)
 
     def judged(self, starts: range, *, ended: bool = False) -> JudgedInstants:
         """Return what `Streamed.judged` does."""
@@ -194,7 +149,7 @@ class Recomputed:
         if not starts:
             return asked.judged(np.zeros((0, 2)))
         begin = (starts.start if final is None else final.next - final.lo) - history.first
-        found = self._values.at(history.columns(), range(begin, begin + len(starts)), ended=ended)
+        found = asked.bounds(history.columns(), range(begin, begin + len(starts)), ended=ended)
         return asked.judged(found if final is None else final.choose(found, final.known))
 
 

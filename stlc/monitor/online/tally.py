@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.compile.ir.support import Reach
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.tolerance import TOLERANCE, StatusInScope
+from stlc.monitor.instants import live_bounds, rule_bounds, span_of
 from stlc.monitor.online.history import Floats
-from stlc.monitor.values import Ends
+from stlc.monitor.prefix_bounds import FAR
+from stlc.monitor.values import Ends, Record
 
 Flags = NDArray[np.bool_]
 
 
 @final
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Asked:
     """Requirement to watch.
 
@@ -54,6 +58,29 @@ class Asked:
     def starts(self, first: int, samples: int) -> range:
         """Starts from `first` on in a trace of `samples` samples."""
         return range(first, samples if self.everywhere else min(self.begin + 1, samples))
+
+    @cached_property
+    def span(self) -> Reach:
+        """Samples before and after a start that its value may depend on; see `span_of`."""
+        return span_of(self.rule, self.horizon)
+
+    def settled(self, samples: int) -> int:
+        """The first instant at which a sample after `samples` of them may change the value."""
+        return max(samples - self.span.future, 0)
+
+    def needs(self, start: int) -> int:
+        """The first sample that instants from `start` on read."""
+        return 0 if self.span.future == FAR else max(start - self.span.past, 0)
+
+    def bounds(self, signals: Mapping[str, Floats], starts: range, *, ended: bool = False) -> Floats:
+        """Least and greatest robustness of each of `rules` in turn, (instants, 2 or 4).
+
+        The bounds are over all continuations; `ended`: the trace ends with the last sample. The samples of a
+        signal, (samples, 1), include all that `starts` read.
+        """
+        bounds, record = rule_bounds if ended else live_bounds, Record.of(signals)
+        found = (bounds(rule, record, starts, self.horizon, self.ending) for rule in self.rules)
+        return np.concatenate([end for ends in found for end in ends], axis=1)
 
     def judged(self, bounds: Floats) -> JudgedInstants:
         """Verdicts from bounds on the robustness and on that which decides, (instants, 2 or 4)."""

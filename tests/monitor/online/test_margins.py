@@ -11,7 +11,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.instants import rule_bounds
 from stlc.monitor.online.online import How, Margin
-from stlc.monitor.online.recompute import GrowingBounds
+from stlc.monitor.online.tally import Asked
 from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
 
@@ -67,7 +67,7 @@ def anew(judge: Monitor, rule, data):  # type: ignore[no-untyped-def]
     ends = []
     for trace in range(TRACES):
         columns = {"x": data[:, 0, trace, None], "y": data[:, 1, trace, None]}
-        ends.append(GrowingBounds([rule], horizon, "open").at(columns, starts).min(axis=0))
+        ends.append(Asked([rule], 0, False, horizon).bounds(columns, starts).min(axis=0))
     return [low for low, _ in ends], [high for _, high in ends]
 
 

@@ -21,7 +21,8 @@ from stlc.monitor.instants import rule_bounds
 from stlc.monitor.online import kernel
 from stlc.monitor.online.kernel import Streamed
 from stlc.monitor.online.online import How, Online
-from stlc.monitor.online.recompute import GrowingBounds, Recomputed
+from stlc.monitor.online.recompute import Recomputed
+from stlc.monitor.online.tally import Asked
 from stlc.monitor.prefix_bounds import FAR, lengthened, prefix_bound, with_seen
 from stlc.monitor.values import Record, bounds, decisive
 from stlc.monitor.verdict import Monitor
@@ -68,7 +69,7 @@ def check_stream(formula: ir.Formula, trace: dict[str, np.ndarray], how: How) ->
     """Compare a stream with the evaluator after each sample, and at its end."""
     rule = random_formulas.a_rule(formula)
     online = Online(compiled(), [rule], how)
-    name, values = rule.name, GrowingBounds([rule], None, "truncate")
+    name, values = rule.name, Asked([rule], 0, False, None, "truncate")
     deciding = decisive(rule, how.tolerance, compiled().signature).formula
     everywhere, cut, said = online.requirement(name).everywhere, how.end == "truncate", {}
     for k in range(len(trace["x"])):
