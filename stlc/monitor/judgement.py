@@ -21,6 +21,7 @@ from stlc.monitor.facts.extent import samples_read
 from stlc.monitor.facts.fact import Fact
 from stlc.monitor.prepared import Floats, Part, Prepared, Timeline
 from stlc.monitor.signals import Gap
+from stlc.monitor.values import Ends
 from stlc.provenance import sha256
 from stlc.source import Source
 from stlc.tabular import frame, html_table, plot
@@ -103,6 +104,7 @@ class RequirementVerdict:
         part: the samples on which the requirement is judged.
         timeline: times of the samples.
         tolerance: a requirement is satisfied if its robustness is at least minus this value.
+        ends: treatment of windows that extend beyond the end of the traces.
         scope: True for traces that satisfy the assumptions, (traces,); None if all do. The others do not
             affect verdicts over all traces.
         reported: `low` and `high` in the requested semantics (definition of min and max); None: the exact.
@@ -130,6 +132,7 @@ class RequirementVerdict:
     part: Part
     timeline: Timeline
     tolerance: float = TOLERANCE
+    ends: Ends = "open"
     scope: Bools | None = None
     reported: tuple[Floats, Floats] | None = None
     counts: Counts | None = None

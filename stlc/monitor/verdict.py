@@ -484,7 +484,7 @@ def _judge(
         least, most = outer(*rule_bounds(deciding, record, starts, ready.horizon, ends))
     holds, fails = TOLERANCE.satisfied(least, tolerance), TOLERANCE.violated(most, tolerance)
     start = part.first + starts.start
-    where = (ready.signals.shape, part, ready.timeline, tolerance)
+    where = (ready.signals.shape, part, ready.timeline, tolerance, ends)
     return RequirementVerdict(rule, start, low, high, holds, fails, *where, subject=ready)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import reference
 from helpers.formula_strategies import GRID, formulas, traces
-from hypothesis import assume, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 
 from stlc.cli.framework.render import render_place
 from stlc.compile.backends.array.graph import evaluate_parts
@@ -18,6 +18,7 @@ from stlc.compile.ir import typed
 from stlc.diagnostics import UsageError
 from stlc.monitor.explain.causes import CauseFinder, CauseNode
 from stlc.monitor.explain.report import explain, names_in, shown
+from stlc.monitor.online.online import How
 from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column
@@ -32,15 +33,22 @@ def nodes(blame: CauseNode) -> Iterator[CauseNode]:
         yield from nodes(part)
 
 
+ENDS = {"open": "upper", "truncate": "truncate"}
+"""End of a trace -> that of a finder of causes."""
+
+
+@pytest.mark.parametrize("end", ENDS)
 @settings(max_examples=15)
 @given(formula=formulas(), env=traces(low=3, batch=1))
-def test_every_node_is_what_it_is_said_to_be(formula: typed.Formula, env: dict[str, np.ndarray]) -> None:
-    trace = reference.Trace({name: column[:, 0] for name, column in env.items()}, GRID, "open")
+def test_every_node_is_what_it_is_said_to_be(
+    end: str, formula: typed.Formula, env: dict[str, np.ndarray]
+) -> None:
+    trace = reference.Trace({name: column[:, 0] for name, column in env.items()}, GRID, end)
     judge = reference.Robustness(trace)
     value = judge.at(formula, 0)
     assert value is not None
     assume(value[1] < 0)
-    tree = CauseFinder(Record(env, NUMPY), GRID).blame(formula, 0)
+    tree = CauseFinder(Record(env, NUMPY), GRID, ENDS[end]).blame(formula, 0)
     assert -abs(tree.rho) == pytest.approx(value[1])
     for node in nodes(tree):
         for sample in node.during or (node.sample,):
@@ -51,20 +59,23 @@ def test_every_node_is_what_it_is_said_to_be(formula: typed.Formula, env: dict[s
         assert all(name in env for name, _ in node.reads)
 
 
-@settings(max_examples=18)
+@pytest.mark.parametrize("end", ENDS)
+@settings(max_examples=18, suppress_health_check=[HealthCheck.filter_too_much])
 @given(formula=formulas(), env=traces(low=3, batch=1))
-def test_the_cause_is_the_value_behind_the_number(formula: typed.Formula, env: dict[str, np.ndarray]) -> None:
+def test_the_cause_is_the_value_behind_the_number(
+    end: str, formula: typed.Formula, env: dict[str, np.ndarray]
+) -> None:
     """The path of minima and maxima ends at it; where it decides alone, changing it changes the number."""
 
     def worth(signals: dict[str, np.ndarray]) -> float:
-        trace = reference.Trace({name: column[:, 0] for name, column in signals.items()}, GRID, "open")
+        trace = reference.Trace({name: column[:, 0] for name, column in signals.items()}, GRID, end)
         value = reference.Robustness(trace).at(formula, 0)
         assert value is not None
         return value[1]
 
     value = worth(env)
     assume(-np.inf < value < 0)
-    tree, alone = CauseFinder(Record(env, NUMPY), GRID).why(formula, 0)
+    tree, alone = CauseFinder(Record(env, NUMPY), GRID, ENDS[end]).why(formula, 0)
     assert (tree.leaf.rho if not tree.leaf.holds else -tree.leaf.rho) == pytest.approx(value)
     if not alone:
         return
@@ -187,6 +198,25 @@ def test_a_cause_in_numbers() -> None:
     assert cause.span.line == 8
     assert [(r.signal, r.value, r.text) for r in cause.readings] == [("v", 1.0, "v = 1 m/s")]
     assert cause.tree.leaf.rho == verdict.robustness[1] == -2.0
+
+
+def test_a_window_that_the_end_cuts_is_explained_at_the_end() -> None:
+    monitor = Monitor("signal x, y\nrequire r: always (x > 0 -> eventually[0, 2] y > 0)", dt=1)
+    x, y = [1.0, 1, -1, -2, 1, 0, 1, 2, 1], [0.0, -1, 1, -1, -1, 0, 1, -1, -1]
+    verdict = monitor.check({"x": np.array(x), "y": np.array(y)}, end="truncate")
+    cause = explain(verdict, "r")
+    online = monitor.online(How(end="truncate", reasons=True))
+    online.push_block(np.c_[x, y])
+    for found in (cause, online.cause("r")):
+        assert found is not None
+        assert (found.because, found.sample) == ("`y > 0` comes closest at t = 8 s, where y = -1", 8)
+
+
+def test_a_planning_window_that_the_end_cuts_is_explained_in_the_recording() -> None:
+    monitor = Monitor("signal x\nrequire r: eventually[0, T] always[0, end] x > 0", dt=1, horizon=3)
+    cause = explain(monitor.check({"x": np.array([1.0, -2.0])}, end="truncate"), "r")
+    assert cause is not None
+    assert (cause.sample, cause.predicate) == (1, "x > 0")
 
 
 def test_what_is_not_violated_has_no_cause() -> None:

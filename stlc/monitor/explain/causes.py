@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.backends.array.graph import evaluate_parts
+from stlc.compile.backends.schedule import Boundary
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.defined import defined_at
@@ -159,6 +160,7 @@ class _Tied:
     """
 
     record: Record
+    end: Boundary
     stop: int | None
     raised: Spot | None = None
     names: dict[ir.Formula, str] = field(default_factory=dict)
@@ -181,7 +183,9 @@ class _Tied:
         if known is not None:
             return known[1]
         missing = [leaf for leaf in _leaves_of(formula) if leaf not in self.names]
-        found = self.record.values(missing, range(self.record.samples), "upper", self.stop) if missing else []
+        found = (
+            self.record.values(missing, range(self.record.samples), self.end, self.stop) if missing else []
+        )
         for leaf, values in zip(missing, found, strict=True):
             self.names[leaf] = f"#{len(self.names)}"
             self.env[self.names[leaf]] = np.asarray(values, np.float64)
@@ -192,7 +196,7 @@ class _Tied:
     def worth(self, formula: ir.Formula, sample: int) -> float:
         coded = self.coded(formula)
         record = replace(self.record, env=self.columns)
-        return float(record.values([coded], range(sample, sample + 1), "upper", self.stop)[0][0, 0])
+        return float(record.values([coded], range(sample, sample + 1), self.end, self.stop)[0][0, 0])
 
 
 def _leaves_of(formula: ir.Formula) -> dict[ir.Formula, None]:
@@ -209,6 +213,8 @@ class CauseFinder:
     Attributes:
         record: signals of the trace, (samples, 1), up to the end of the evaluated window.
         grid: time step and horizon of the signals.
+        end: treatment of windows that extend beyond the end of the trace: "upper" gives the upper bound,
+            "truncate" clips them.
         cache: (formula, truth value that it should have) -> the lowered formula, negated for False.
         known: lowered formula -> list of pairs (range of instants, upper bounds on the robustness at them).
         tied: predicate values, one of them slightly increased, on which formulas are then evaluated.
@@ -218,6 +224,7 @@ class CauseFinder:
 
     record: Record
     grid: Grid
+    end: Boundary = "upper"
     cache: dict[tuple[typed.Formula, bool], ir.Formula] = field(default_factory=dict)
     known: dict[ir.Formula, list[tuple[range, Floats]]] = field(default_factory=dict)
     tied: _Tied | None = None
@@ -241,7 +248,7 @@ class CauseFinder:
         samples = self.record.samples
         if equal[-1][1] >= samples or samples * len(_leaves_of(lowered)) > _MOST_NUMBERS:
             return tree, False
-        tied = _Tied(self.record, self.stop)
+        tied = _Tied(self.record, self.end, self.stop)
         if tied.worth(lowered, sample) != worth:
             return tree, False
         leaf = tree.leaf
@@ -271,7 +278,7 @@ class CauseFinder:
 
         def worth(env: Mapping[str, Floats]) -> float:
             at = range(leaf.sample, leaf.sample + 1)
-            return float(replace(record, env=env).values([own], at, "upper", self.stop)[0][0, 0])
+            return float(replace(record, env=env).values([own], at, self.end, self.stop)[0][0, 0])
 
         before = worth(record.env)
         spots = [
@@ -320,7 +327,9 @@ class CauseFinder:
                 found = self._until(node, formula)
             case typed.Shift(_, steps, body):
                 there = sample + steps
-                decided = there < self.record.samples or self._margin(body, there, wanted) != math.inf
+                decided = there < self.record.samples or (
+                    self.end == "upper" and self._margin(body, there, wanted) != math.inf
+                )
                 parts = (self.blame(body, there, wanted),) if there >= 0 and decided else ()
                 found = replace(node, parts=parts)
             case typed.Edge():
@@ -395,7 +404,8 @@ class CauseFinder:
         found = self._found(lowered, instants)
         if found is None:
             env = self.record.env if self.tied is None else self.tied.columns
-            parts = evaluate_parts(lowered, env, instants, ops=self.record.ops, end="upper", stop=self.stop)
+            ops, end, stop = self.record.ops, self.end, self.stop
+            parts = evaluate_parts(lowered, env, instants, ops=ops, end=end, stop=stop)
             for node, its, values in parts:
                 self.known.setdefault(node, []).append((its, values[:, 0]))
             found = self._found(lowered, instants)
@@ -517,6 +527,8 @@ class CauseFinder:
 
     def _stop(self, lowered: ir.Formula) -> int:
         """First instant at which operands are unknown; past operators read samples before it, too."""
+        if self.end == "truncate":
+            return self.record.samples
         return self.record.samples + min(max(each.history for each in lowered.operands), _MOST_LATER)
 
     def _temporal(self, node: CauseNode, formula: typed.Temporal) -> CauseNode:
@@ -538,6 +550,7 @@ class CauseFinder:
         last = None if formula.op == "since" or lowered.windowed is None else lowered.windowed.window.hi
         # the window extends to instants at which operands are unknown
         beyond = last is not None and (not instants or instants[-1] < sample + last)
+        beyond = beyond and self.end == "upper"
         if not instants and not beyond:
             return node
         way = -1 if formula.op == "since" else 1

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
@@ -17,8 +18,8 @@ from stlc.jsontext import Num
 from stlc.monitor.explain.causes import CauseFinder, CauseNode, Violations
 from stlc.monitor.instants import rule_bounds, window_of
 from stlc.monitor.judgement import RequirementVerdict, Verdict
-from stlc.monitor.prepared import Part, Prepared, Timeline
-from stlc.monitor.values import Record
+from stlc.monitor.prepared import Floats, Part, Prepared, Timeline
+from stlc.monitor.values import Ends, Record
 from stlc.signature import Column
 from stlc.source import Label, Span
 
@@ -186,12 +187,16 @@ def violations(verdict: Verdict, name: str, trace: int, most: int) -> list[Viola
     judgement, definitions = verdict[name], verdict.subject.compiled.spec.definitions
     judged = _JudgedTrace.of(judgement, verdict.subject, trace)
     found: dict[int, tuple[int, CauseFinder, typed.Formula, bool]] = {}
-    finder = None
-    for start in (judgement.start - judged.first + np.flatnonzero(judgement.fails[:, trace])).tolist():
+    finders: dict[bool, CauseFinder] = {}
+    begin = judgement.start - judged.first
+    cut = judged.cut(range(begin, begin + len(judgement.fails))).tolist()
+    for start in (begin + np.flatnonzero(judgement.fails[:, trace])).tolist():
         if not judged.shows(start):
             continue
-        if finder is None or judged.window is not None:
-            finder = judged.finder(start)
+        own_end = cut[start - begin]
+        if own_end not in finders or judged.window is not None:
+            finders[own_end] = judged.finder(start, cut=own_end)
+        finder = finders[own_end]
         own = list(finder.violations(judged.formula, np.array([start])))
         for each in own or [Violations(judged.formula, True, np.array([start]))]:
             for sample in each.instants.tolist():
@@ -216,7 +221,7 @@ def cause_of(judgement: RequirementVerdict) -> Cause | None:
     start -= judged.first
     if not judged.shows(start):
         return None
-    finder = judged.finder(start)
+    finder = judged.finder(start, cut=bool(judged.cut(range(start, start + 1))[0]))
     tree, alone = finder.why(judged.formula, start)
     return judged.cause(finder.record, start, tree, alone, definitions)
 
@@ -248,16 +253,26 @@ class _JudgedTrace:
         """True if the samples show the violation at `start`; of several in a step, one was chosen."""
         if self.subject.signals.times is None:
             return True
-        rule, record = self.judgement.rule, self.subject.record
-        (high,) = rule_bounds(rule, record, range(start, start + 1), self.subject.horizon, "open")[1]
-        return float(high.max()) < 0.0
+        return bool(self.greatest(range(start, start + 1), self.judgement.ends)[0] < 0.0)
 
-    def finder(self, start: int) -> CauseFinder:
+    def greatest(self, starts: range, ends: Ends) -> Floats:
+        """Upper bounds on the robustness at `starts`, (count,)."""
+        rule, record = self.judgement.rule, self.subject.record
+        return np.asarray(rule_bounds(rule, record, starts, self.subject.horizon, ends)[1].max(axis=1))
+
+    def cut(self, starts: range) -> NDArray[np.bool_]:
+        """Starts whose robustness depends on a window that the end cuts, (count,)."""
+        if self.judgement.ends == "open":
+            return np.zeros(len(starts), dtype=np.bool_)
+        return np.not_equal(*(self.greatest(starts, ends) for ends in ("truncate", "open")))
+
+    def finder(self, start: int, *, cut: bool) -> CauseFinder:
         record = self.subject.record
         stop = None if self.window is None else start + self.window + 1
         if stop is not None and stop <= record.samples:
             record, stop = record.cut(stop), None
-        return CauseFinder(record, self.subject.compiled.grid, stop=stop)
+        grid = self.subject.compiled.grid
+        return CauseFinder(record, grid, "truncate") if cut else CauseFinder(record, grid, stop=stop)
 
     def cause(
         self, record: Record, start: int, tree: CauseNode, alone: bool, definitions: dict[str, ast.Expr]

@@ -112,6 +112,7 @@ class Online:
         self, compiled: Compiled, rules: Sequence[CompiledRequirement], how: How | None = None
     ) -> None:
         self.how = how or How()
+        self._ends: Ends = "truncate" if self.how.end == "truncate" else "open"
         self.compiled = compiled
         self._needs = needs_of(compiled, [*rules, *compiled.assumptions])
         self.signals = tuple(need.column.name for need in self._needs)
@@ -129,7 +130,7 @@ class Online:
         self._step = None if compiled.grid.dt is None else float(compiled.grid.dt)
         self._recomputed = [each for each in watched if isinstance(each, Recomputed)]
         self._gaps: dict[str, Gap] = {}
-        self._buffer = TraceBuffer(compiled, self.how.t0) if self.how.reasons else None
+        self._buffer = TraceBuffer(compiled, self.how.t0, self._ends) if self.how.reasons else None
         self._plain = self._kernel is not None and not self._recomputed and self._buffer is None
 
     def _ask(self, rule: CompiledRequirement, *, once: bool = False) -> Asked:
@@ -140,10 +141,9 @@ class Online:
         if everywhere and not rule.windowed and rule.uses_end:
             message = f"`{rule.name}` runs to the end: at every start it would stay open until then"
             raise usage(message, "judge it once, without `--at all`")
-        ending: Ends = "truncate" if self.how.end == "truncate" else "open"
         deciding = decisive(rule, self.how.tolerance, self.compiled.signature)
         rules = (rule,) if deciding is rule else (rule, deciding)
-        return Asked(rules, begin, everywhere, horizon, ending, self.how.tolerance)
+        return Asked(rules, begin, everywhere, horizon, self._ends, self.how.tolerance)
 
     def _watch(self, asked: Sequence[Asked]) -> tuple[StreamKernel | None, list[Watched]]:
         """Kernel of all requirements that have transducers, and what watches each requirement."""

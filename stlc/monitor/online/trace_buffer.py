@@ -21,7 +21,7 @@ from stlc.monitor.online.tally import RequirementSummary
 from stlc.monitor.prefix_bounds import FAR
 from stlc.monitor.prepared import Part, Prepared
 from stlc.monitor.signals import Signals
-from stlc.monitor.values import Record
+from stlc.monitor.values import Ends, Record
 
 _MOST = 1 << 21
 """Fewest numbers stored, at most twice as many; causes are computed before samples are dropped."""
@@ -31,11 +31,12 @@ _MOST = 1 << 21
 class TraceBuffer:
     """Buffer of the latest samples of a stream, and of causes of violations.
 
-    `t0` is the time of the first sample in seconds.
+    `t0` is the time of the first sample in seconds, `ends` the treatment of windows beyond the end.
     """
 
     compiled: Compiled
     t0: float
+    ends: Ends
     _history: ColumnHistory = field(default_factory=ColumnHistory)
     _found: dict[str, dict[tuple[int, float], Cause]] = field(default_factory=dict)
     _width: int = 1
@@ -67,7 +68,7 @@ class TraceBuffer:
             return None
         first, start, env = excerpt
         record, grid = Record.of(env), self.compiled.grid
-        low, high = rule_bounds(rule, record, range(start, start + 1), grid.horizon, "open")
+        low, high = rule_bounds(rule, record, range(start, start + 1), grid.horizon, self.ends)
         if first and high[0, 0] != worst.high:
             return None
         step = None if grid.dt is None else float(grid.dt)
@@ -75,7 +76,7 @@ class TraceBuffer:
         fails = np.ones((1, 1), dtype=np.bool_)
         subject, part = Prepared(self.compiled, (rule,), signals, record), Part(0, record.samples)
         judged = (rule, start, low, high, ~fails, fails, (), part, subject.timeline)
-        cause = cause_of(RequirementVerdict(*judged, subject=subject))
+        cause = cause_of(RequirementVerdict(*judged, ends=self.ends, subject=subject))
         if cause is None:
             return None
         sample = first + cause.sample
