@@ -238,6 +238,8 @@ def check_length(rule: CompiledRequirement, samples: int, starts: range, grid: G
     needed, length = last * step, (samples - 1) * step
     help_ = ["`--end truncate` evaluates on what there is"]
     message = "this reads samples outside the trace, however long it is"
+    if starts == starts_of(rule, samples, grid.horizon, None):  # a longer trace has more of them
+        starts = starts_of(rule, last + 1, grid.horizon, None)
     if last >= samples and defined_at(rule.formula, last + 1, starts):
         message = f"this needs {needed:.6g} {unit} of signal; the trace has {length:.6g} {unit}"
         help_.insert(0, f"record {needed - length:.6g} {unit} more, or shorten the intervals")

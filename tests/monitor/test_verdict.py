@@ -259,9 +259,12 @@ def test_a_short_trace_satisfies_violates_or_does_not_say() -> None:
 
 
 @pytest.mark.parametrize("samples", [1, 2, 9, 60])
-@pytest.mark.parametrize("formula", ["always (a > 0 -> eventually[0 s, 2 s] a > 1)", "prev(a) > 0"])
+@pytest.mark.parametrize(
+    "formula",
+    ["always (a > 0 -> eventually[0 s, 2 s] a > 1)", "prev(a) > 0", "eventually[T, T] next(a) > 0"],
+)
 def test_no_trace_is_long_enough_for_some_requirements(formula: str, samples: int) -> None:
-    monitor = Monitor(f"signal a\nrequire r: {formula}\n", dt=1)
+    monitor = Monitor(f"signal a\nrequire r: {formula}\n", dt=1, horizon=3)
     with pytest.raises(TraceError, match=r"E306: this reads samples outside the trace") as caught:
         monitor.check({"a": np.ones(samples)}, end="strict")
     (finding,) = caught.value.diagnostics
