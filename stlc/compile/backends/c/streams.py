@@ -95,47 +95,52 @@ def _windowed(whole: Any, least: str) -> ir.Formula:
     return together if hi is not None or whole.back else Begun(lo, together)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Node:
     """A sub-formula and its transducers.
 
     Attributes:
-        index: number of the node; operands come before the nodes that read them.
         form: the sub-formula, in normal form.
-        args: numbers of the operands.
+        args: the operands.
         near: least instant, relative to now, at which it reads its operands or signals.
         far: greatest one.
         delay: samples after an instant until its value is known.
-        readers: numbers of the nodes that read it.
         ahead: instants after the latest sample at which its truth may be known.
+        ends: whether its own window extends to the end of the trace.
+        endless: whether its window, or that of a part, does.
+        lasts: whether its truth may be known at all instants from one on.
+        index: number of the node; operands come before the nodes that read them.
+        readers: the nodes that read it.
         age: instants before the latest sample at which its truth still matters.
         kept: greatest number of samples after which its values are still read.
-        endless: whether it has a window to the end of the trace.
-        lasts: whether its truth may be known at all instants from one on.
+        ring: place of its values in the state.
     """
 
-    index: int
     form: ir.Formula
-    args: tuple[int, ...]
+    args: tuple[Node, ...]
     near: int
     far: int
     delay: int
-    readers: list[int] = field(default_factory=list)
-    ahead: int = 0
+    ahead: int
+    ends: bool
+    endless: bool
+    lasts: bool
+    index: int = 0
+    readers: list[Node] = field(default_factory=list)
     age: int = 0
     kept: int = 0
-    endless: bool = False
-    lasts: bool = False
+    ring: int = 0
 
     @property
     def dual(self) -> bool:
         """True if the node takes a minimum."""
         return PICKS.get(getattr(self.form, "op", "")) == "min"
 
-    @property
-    def ends(self) -> bool:
-        """True if its own window extends to the end of the trace."""
-        return isinstance(self.form, ir.Until) and self.form.window.hi is None
+    def read(self, first: int, since: int) -> Row:
+        """Row of this node as an operand that is read at the instant `since` samples ago."""
+        if isinstance(self.form, ir.Truth):
+            return (first + self.index, -2 if self.form.value else -1, 0, 0)
+        return (first + self.index, self.ring, _ring(self.kept + 1) - 1, since)
 
     @property
     def since(self) -> int:
@@ -182,54 +187,50 @@ class Graph:
 
     def __init__(self, formula: ir.Formula, lag: int, signals: Mapping[str, int]) -> None:
         self.signals = signals
-        self.rings: dict[int, int] = {}
-        self.nodes: list[Node] = []
-        self._known: dict[ir.Formula, int] = {}
+        self._known: dict[ir.Formula, Node] = {}
         self.root = self._place(normal(formula))
-        self._sort()
-        top = self.nodes[self.root]
-        self.skeleton: dict[tuple[int, int], list[int]] = {}
+        self.nodes = sorted(
+            self._known.values(), key=lambda node: (node.endless, not isinstance(node.form, ir.Predicate))
+        )
+        """Predicates first, nodes with windows to the end last; operands stay before their readers."""
+        self.skeleton: dict[tuple[Node, int], list[int]] = {}
         """Part of a formula with windows to the end, and instants after the formula's -> its operands."""
-        if top.endless:
+        if self.root.endless:
             self._skeleton(self.root, 0)
-            lag = max(lag, *(self.nodes[part].delay + later for part, later in self.skeleton))
-        self.coefficients = [key for key in self.skeleton if self.nodes[key[0]].ends]
+            lag = max(lag, *(part.delay + later for part, later in self.skeleton))
+        self.coefficients = [key for key in self.skeleton if key[0].ends]
         if len(self.coefficients) > _MOST:
             raise Untranslatable("too many windows to the end")
-        self.lag = max(lag, top.delay)
+        self.lag = max(lag, self.root.delay)
         self._sizes()
 
     # ------------------------------------------------------------------- construction
 
-    def _place(self, form: ir.Formula) -> int:
+    def _place(self, form: ir.Formula) -> Node:
         if form in self._known:
             return self._known[form]
-        parts = form.operands
+        parts, outside = form.operands, getattr(form, "outside", None)
         if isinstance(form, (ir.Until, ir.Since)) and parts[0] == ir.Truth(PICKS[form.op] == "max"):
             parts = parts[1:]
         args = tuple(map(self._place, parts))
         args = tuple(dict.fromkeys(args)) if isinstance(form, ir.BoolOp) else args
         near, far = _reads(form)
-        delay = max(max((self.nodes[arg].delay for arg in args), default=0) + far, 0)
-        node = Node(len(self.nodes), form, args, near, far, delay)
-        node.endless = node.ends or any(self.nodes[arg].endless for arg in args)
-        self.nodes.append(node)
-        self._known[form] = node.index
-        return node.index
+        delay = max(max((arg.delay for arg in args), default=0) + far, 0)
+        ahead = max((arg.ahead for arg in args), default=0)
+        if outside is not None:
+            ahead = max(ahead, -1)
+        ahead -= far if isinstance(form, ir.Predicate) else near
+        if isinstance(form, ir.PastTemporal):
+            ahead = max(ahead, -far - 1)
+        lasts = isinstance(form, (ir.Truth, ir.Since)) or any(arg.lasts for arg in args)
+        ends = isinstance(form, ir.Until) and form.window.hi is None
+        endless = ends or any(arg.endless for arg in args)
+        self._known[form] = Node(form, args, near, far, delay, ahead, ends, endless, lasts)
+        return self._known[form]
 
-    def _sort(self) -> None:
-        """Number predicates first, nodes with windows to the end last; operands stay before their readers."""
-        self.nodes.sort(key=lambda node: (node.endless, not isinstance(node.form, ir.Predicate)))
-        place = {node.index: i for i, node in enumerate(self.nodes)}
-        for i, node in enumerate(self.nodes):
-            node.index, node.args = i, tuple(place[arg] for arg in node.args)
-            for arg in dict.fromkeys(node.args):
-                self.nodes[arg].readers.append(i)
-        self.root = place[self.root]
-
-    def _skeleton(self, index: int, later: int) -> int:
+    def _skeleton(self, node: Node, later: int) -> int:
         """Add operators with windows to the end, and the nodes without that they read; return the number."""
-        node, key = self.nodes[index], (index, later)
+        key = node, later
         if node.endless:
             steps = getattr(node.form, "steps", 0)
             fixed = isinstance(node.form, ir.Windowed) and not node.ends
@@ -241,34 +242,20 @@ class Graph:
         return [*self.skeleton].index(key)
 
     def _sizes(self) -> None:
-        for node in self.nodes:
-            node.ahead = max((self.nodes[arg].ahead for arg in node.args), default=0)
-            if getattr(node.form, "outside", None) is not None:
-                node.ahead = max(node.ahead, -1)
-            node.ahead -= node.far if isinstance(node.form, ir.Predicate) else node.near
-            if isinstance(node.form, ir.PastTemporal):
-                node.ahead = max(node.ahead, -node.far - 1)
-            node.lasts = isinstance(node.form, (ir.Truth, ir.Since)) or any(
-                self.nodes[arg].lasts for arg in node.args
-            )
-        self.nodes[self.root].age = self.lag
+        for index, node in enumerate(self.nodes):
+            node.index = index
+            for arg in dict.fromkeys(node.args):
+                arg.readers.append(node)
+        self.root.age = self.lag
         for node in reversed(self.nodes):
             node.ahead = max(node.ahead, 0)
-            for part in (self.nodes[arg] for arg in node.args):
-                part.ahead = max(part.ahead, node.ahead if isinstance(node.form, ir.BoolOp) else 0)
-                part.age = max(part.age, node.age - node.near)
+            for arg in node.args:
+                arg.ahead = max(arg.ahead, node.ahead if isinstance(node.form, ir.BoolOp) else 0)
+                arg.age = max(arg.age, node.age - node.near)
         reads = [(arg, node.since) for node in self.nodes if not node.endless for arg in node.args]
-        reads += [(index, self.lag - later) for index, later in self.skeleton or {(self.root, 0)}]
-        for index, since in reads:
-            part = self.nodes[index]
-            part.kept = max(part.kept, since - part.delay)
-
-    def _read(self, first: int, index: int, since: int) -> Row:
-        """Row of an operand whose value is read at the instant `since` samples ago."""
-        part = self.nodes[index]
-        if isinstance(part.form, ir.Truth):
-            return (first + index, -2 if part.form.value else -1, 0, 0)
-        return (first + index, self.rings[index], _ring(part.kept + 1) - 1, since)
+        reads += [(node, self.lag - later) for node, later in self.skeleton or {(self.root, 0)}]
+        for node, since in reads:
+            node.kept = max(node.kept, since - node.delay)
 
     @property
     def samples(self) -> int:
@@ -304,12 +291,12 @@ class Graph:
                     lo, hi = steps, _TRUTHS[outside]
             flags = _DUAL * node.dual | _WEAK * getattr(form, "weak", False)
             flags |= _UNCUT * isinstance(form, Lasting) | _ENDLESS * node.endless
-            flags |= _LASTS * node.lasts | _ROOT * (node.index == self.root) | _AHEAD * node.foreseen
-            operands = out.add("operands", *(self._read(first, arg, node.since) for arg in node.args))
-            readers = out.add("readers", *((first + reader,) for reader in node.readers))
+            flags |= _LASTS * node.lasts | _ROOT * (node is self.root) | _AHEAD * node.foreseen
+            operands = out.add("operands", *(arg.read(first, node.since) for arg in node.args))
+            readers = out.add("readers", *((first + reader.index,) for reader in node.readers))
             rows, kept = node.rows, _ring(node.kept + 1)
             window = ends = place = skip = 0
-            ring = self.rings[node.index] = 0 if node.endless else room(kept)
+            node.ring = 0 if node.endless else room(kept)
             if windows or (isinstance(form, ir.Until) and not node.endless):
                 window, place, ints = room((hi - lo + 2) * (1 if windows else 2)), ints, ints + 1
             elif isinstance(form, ir.Since):
@@ -318,36 +305,36 @@ class Graph:
             if windows or isinstance(form, ir.BoolOp):
                 skip = out.room("ints", rows)
             if windows:
-                ends = out.room("ints", self.nodes[node.args[0]].rows)
+                ends = out.room("ints", node.args[0].rows)
             since = out.room("times", 3 if windows else 2 * node.lasts)
             sizes = (node.delay, node.age, node.ahead, operands, len(node.args), readers, len(node.readers))
-            places = (ring, kept - 1, window, place, truth, rows - 1, skip, ends, since)
+            places = (node.ring, kept - 1, window, place, truth, rows - 1, skip, ends, since)
             out.add("nodes", (_KINDS[type(form)], flags, lo, hi, *sizes, *places))
         entries, bits = self._entries(first, out), len(self.coefficients)
         coefficients = room(1 << bits) if bits else 0
-        neutral = sum(1 << i for i, (index, _) in enumerate(self.coefficients) if self.nodes[index].dual)
+        neutral = sum(1 << i for i, (node, _) in enumerate(self.coefficients) if node.dual)
         steps = sum(not node.endless for node in self.nodes)
         leaves = sum(isinstance(node.form, ir.Predicate) for node in self.nodes)
-        shape = (first, first + leaves, first + steps, len(self.nodes), first + self.root, self.lag, self.far)
+        shape = (first, first + leaves, first + steps, len(self.nodes), first + self.root.index)
         to_end = (coefficients, bits, neutral, out.add("entries", *entries), len(entries))
         if len(entries) > _ENTRIES:
             raise Untranslatable("too many operators around windows to the end")
         state = (out.room("spans", spans * (1 + cut)), spans, out.room("ints", ints * (1 + cut)), ints)
-        return out.add("graphs", (*shape, sum(node.foreseen for node in self.nodes), *to_end, *state))
+        foreseen = sum(node.foreseen for node in self.nodes)
+        return out.add("graphs", (*shape, self.lag, self.far, foreseen, *to_end, *state))
 
     def _entries(self, first: int, out: Streams) -> list[Row]:
         """Parts of a formula with windows to the end, operands first."""
         entries: list[Row] = []
-        for (index, later), args in self.skeleton.items():
-            node = self.nodes[index]
+        for (node, later), args in self.skeleton.items():
             if not node.endless:
-                operands = out.add("operands", self._read(first, index, self.lag - later))
+                operands = out.add("operands", node.read(first, self.lag - later))
                 entries.append((_KINDS[ir.Predicate], 0, operands, 1, later, 0))
                 continue
-            own = [first + index] if node.ends else []
+            own = [first + node.index] if node.ends else []
             operands = out.add("operands", *((arg, 0, 0, 0) for arg in [*args, *own]))
             flags = _WEAK * getattr(node.form, "weak", False) | _DUAL * node.dual
-            bit = self.coefficients.index((index, later)) if node.ends else 0
+            bit = self.coefficients.index((node, later)) if node.ends else 0
             there = later + getattr(node.form, "steps", 0)
             entries.append((_KINDS[type(node.form)], flags, operands, len(args), there, bit))
         return entries
@@ -400,7 +387,7 @@ static void predicates_{number}(const samples *x, at n, int mode, int clip, span
     }} else if (clip) {{
       out = certain({int(atom.sign < 0)});
     }}
-    v[{self.rings[node.index]} + (t & {_ring(node.kept + 1) - 1})] = out;
+    v[{node.ring} + (t & {_ring(node.kept + 1) - 1})] = out;
   }}
 """
 
@@ -504,7 +491,7 @@ def streams_of(rules: Sequence[Rule], signals: Sequence[str], *, cut: bool) -> S
             values = Graph(rule.formula, deciding.lag, index)
         truths = added(deciding)
         numbers = (truths if values is deciding else added(values), truths)
-        root = deciding.nodes[deciding.root].rows
+        root = deciding.root.rows
         out.add("rules", (*numbers, out.room("ints", root), root - 1))
     if any(size >= _LARGEST for size in out.sizes.values()):
         raise Untranslatable("windows of more samples than memory holds")
