@@ -10,7 +10,6 @@ import pytest
 
 from stlc.diagnostics import SpecError
 from stlc.monitor.verdict import Monitor
-from tests.helpers.open_starts import open_starts
 
 HEAD = """\
 signal x, y
@@ -103,5 +102,5 @@ require r: alw[0, T - 3000 ms) (not x <= -1.24 & if z > 0.47 then b else (c) & (
     stream = monitor.online()
     for k in range(14):
         stream.push({name: values[k] for name, values in signals.items()})
-        for _, low, high in open_starts(stream, "r"):
+        for _, low, high in stream.open_starts("r"):
             assert low - 1e-9 <= -0.329 <= high + 1e-9

@@ -22,7 +22,6 @@ from stlc.diagnostics import SpecError, TraceError
 from stlc.monitor.instants import window_of
 from stlc.monitor.online.online import How, Online
 from stlc.monitor.verdict import Monitor
-from tests.helpers.open_starts import open_starts
 
 TASTES = (
     Taste(bools=True),
@@ -62,7 +61,7 @@ def check_stream(case: Case, monitor: Monitor) -> None:
         pushed.push({name: values[k] for name, values in case.signals.items()})
         known = {name: values[: k + 1] for name, values in case.signals.items()}
         bounds = so_far(case, monitor, rule, known, everywhere=pushed.requirement("r").everywhere)
-        now = {start: (low, high) for start, low, high in open_starts(pushed, "r")}
+        now = {start: (low, high) for start, low, high in pushed.open_starts("r")}
         for start, (low, high) in now.items():
             if bounds is not None:
                 case.same((low, high), bounds[start], f"bounds at {start} after {k + 1}")
@@ -106,7 +105,7 @@ def check_promises(case: Case, monitor: Monitor, how: How) -> None:
         online.push({name: values[k] for name, values in case.signals.items()})
         for decision in online.verdicts():
             said[decision.start] = decision.status
-        for start, low, high in open_starts(online, "r"):
+        for start, low, high in online.open_starts("r"):
             least[start] = max(least.get(start, low), low)
             most[start] = min(most.get(start, high), high)
         known = {name: values[: k + 1] for name, values in case.signals.items()}

@@ -270,6 +270,13 @@ class Online:
         """Number of samples received."""
         return self._history.samples if self._kernel is None else self._kernel.samples
 
+    def open_starts(self, name: str) -> list[tuple[int, float, float]]:
+        """Starts of the requirement `name` that are not final: (start, least, greatest robustness)."""
+        watched = self._find(name)
+        starts = watched.asked.starts(watched.tally.next, self.samples)
+        judged = watched.judged(starts)
+        return list(zip(starts, judged.low.tolist(), judged.high.tolist(), strict=True))
+
     def bounds(self, name: str, start: int) -> tuple[float, float]:
         """Least and greatest robustness of the requirement `name` at a start, over all continuations.
 

@@ -23,7 +23,6 @@ from stlc.monitor.online.online import How
 from stlc.monitor.prefix_bounds import FAR, lengthened, prefix_bound, with_seen
 from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
-from tests.helpers.open_starts import open_starts
 
 EXAMPLES = int(os.environ.get("STLC_CASES", "30"))
 """Number of random formulas and traces."""
@@ -145,7 +144,7 @@ def test_a_verdict_is_never_taken_back(written: str) -> None:
         for k in range(12):
             online.push({"b": whole["b"][k]})
             said |= {decision.status for decision in online.verdicts()}
-            for _, least, most in open_starts(online, "r"):
+            for _, least, most in online.open_starts("r"):
                 low, high = max(low, least), min(high, most)
             final = online.finish()["r"]
             assert low <= final.low <= final.high <= high, (end, k)
@@ -246,7 +245,7 @@ def test_open_starts_and_standing() -> None:
     online = monitor_of("windowed", "bounded").online()
     for k in range(3):
         assert not online.push({"a": 1.0, "b": -1.0, "q": [0.0, 0.0]}) or k == 0
-    assert [start for start, _, _ in open_starts(online, "r_windowed")] == [0, 1, 2]
+    assert [start for start, _, _ in online.open_starts("r_windowed")] == [0, 1, 2]
     assert online.standing("r_bounded").status == "inconclusive"
     assert (online.standing("r_bounded").low, online.standing("r_bounded").high) == (-np.inf, 1.0)
     with pytest.raises(StlcError, match="no requirement `bound`"):
@@ -347,7 +346,7 @@ def test_values_that_are_final_need_no_samples(formula: str, end, at: int | None
         online.push([trace[name][k] for name in online.signals])
         if end == "open" and k in (5, 90, 140):
             low, high = monitor.bounds({name: x[: k + 1] for name, x in trace.items()}, at=at or 0)
-            ((_, least, most),) = open_starts(online, "r")
+            ((_, least, most),) = online.open_starts("r")
             assert (least, most) == ((-np.inf, high) if formula.startswith("always") else (low, np.inf))
     assert len(next(iter(online._history.columns().values()))) < 100
     wanted, found = monitor.check(trace, at=at, end=end)["r"], online.finish()["r"]

@@ -10,7 +10,6 @@ import pytest
 from stlc.diagnostics import TraceError
 from stlc.monitor.online.online import How
 from stlc.monitor.verdict import Monitor
-from tests.helpers.open_starts import open_starts
 
 HEAD = "signal a\nsignal b\nsignal n: int\n"
 REQUIREMENTS = {
@@ -53,7 +52,7 @@ def test_every_requirement_is_as_it_is_alone(tolerance: float, at) -> None:
         assert together.push(sample) == sum(each.push(sample) for each in alone.values())
         assert list(together.verdicts()) == [each for one in alone.values() for each in one.verdicts()]
         for name in REQUIREMENTS:
-            assert open_starts(together, name) == open_starts(alone[name], name)
+            assert together.open_starts(name) == alone[name].open_starts(name)
     finished = together.finish()
     for name in REQUIREMENTS:
         assert finished[name] == alone[name].finish()[name]

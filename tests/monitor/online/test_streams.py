@@ -26,7 +26,6 @@ from stlc.monitor.online.tally import Asked
 from stlc.monitor.prefix_bounds import FAR, lengthened, prefix_bound, with_seen
 from stlc.monitor.values import Record, bounds, decisive
 from stlc.monitor.verdict import Monitor
-from tests.helpers.open_starts import open_starts
 
 EXAMPLES = int(os.environ.get("STLC_CASES", "20"))
 """Number of random formulas and traces."""
@@ -84,7 +83,7 @@ def check_stream(formula: ir.Formula, trace: dict[str, np.ndarray], how: How) ->
             assert online.bounds(name, decision.start) == (low[decision.start], high[decision.start])
         if last := online.requirement(name).everywhere and online._find(name).tally.next:
             assert online.bounds(name, last - 1) == (low[last - 1], high[last - 1])
-        for start, least, most in open_starts(online, name):
+        for start, least, most in online.open_starts(name):
             assert (least, most) == (low[start], high[start])
         low, high = so_far(deciding, known, starts, settled, cut=cut)
         wanted = {s: "satisfied" for s in starts if low[s] >= -how.tolerance}

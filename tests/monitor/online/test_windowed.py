@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from stlc.monitor.verdict import Monitor
-from tests.helpers.open_starts import open_starts
 
 REQUIREMENTS = {
     "within": "always[0, T] (a > 0 or eventually[0, end] b > 0)",
@@ -35,7 +34,7 @@ def test_bounds_are_those_of_the_samples_so_far(name: str, step: int) -> None:
             low, high = monitor.bounds(known)
             tally = online.standing("r")
             assert (tally.low, tally.high) == (low[: tally.instants].min(), high[: tally.instants].min())
-            opened = open_starts(online, "r")
+            opened = online.open_starts("r")
             assert opened
             for start, least, most in opened:
                 assert (least, most) == (low[start], high[start]), (start, k)
