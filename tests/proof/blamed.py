@@ -228,7 +228,7 @@ def _change(case: Case, monitor: Monitor, cause: Cause, rho: float) -> Iterator[
 
 
 def _margin(leaf: CauseNode, trace: reference.Trace) -> float:
-    ends = _Definition(trace).at(leaf.thawed, leaf.sample, not leaf.holds)
+    ends = _Definition(trace).at(leaf.substituted, leaf.sample, not leaf.holds)
     assert ends is not None
     return -ends[0] if leaf.holds else ends[1]
 

@@ -106,7 +106,7 @@ class CauseNode:
         return self.formula.span
 
     @property
-    def thawed(self) -> typed.Formula:
+    def substituted(self) -> typed.Formula:
         """The sub-formula of a predicate with its frozen values in place."""
         values = {key: kept.num for key, kept in zip(_frozen_in(self), self.frozen, strict=True)}
         return self.formula.substitute_frozen(values)
@@ -270,7 +270,7 @@ class CauseFinder:
         """
         leaf, record = tree.leaf, self.record
         names = {name for name, _ in leaf.reads}
-        own = self._lowered(leaf.thawed, not leaf.holds)
+        own = self._lowered(leaf.substituted, not leaf.holds)
         others = set(lowered.predicates()) - set(_leaves_of(own))
         shared = len(names) < len(leaf.reads) or any(other.num.columns & names for other in others)
         if not tree.path_moves or not shared:
@@ -391,8 +391,8 @@ class CauseFinder:
         if key not in self.cache:
             goal = formula if wanted else typed.Not(formula.span, formula)
             bound = {key: kept.num for key, kept in self.frozen.items()}
-            thawed = self.grid.lower(goal, []).substitute_frozen(bound)
-            given = assume_missing_true(thawed, self.record.env)
+            substituted = self.grid.lower(goal, []).substitute_frozen(bound)
+            given = assume_missing_true(substituted, self.record.env)
             self.cache[key] = self.record.sides(given)[1]
         return self.cache[key]
 

@@ -30,7 +30,7 @@ typedef struct { int32_t kind, flags, first, count, later, bit; } entry;
 /* Nodes: predicates up to `leaves`, others with values up to `steps`, and those with windows to the end; how many have a
    truth that may be known ahead (AHEAD). */
 typedef struct {
-  int32_t first, leaves, steps, count, root, lag, far, foreseen, coefficients, bits, neutral, entries, entered;
+  int32_t first, leaves, steps, count, root, lag, far, early, coefficients, bits, neutral, entries, entered;
   int32_t spans, span_count, ints, int_count; /* its parts of the state; another follows for a trace that cuts windows */
 } graph;
 /* Graphs of the robustness and of the verdict, often the same one; where the starts that the latest step decided are. */
@@ -538,7 +538,7 @@ static void begin(monitor *m, int32_t r, const graph *g) {
     const int truth = root->kind == TRUTH ? root->lo : m->truths[root->truth + (n & root->truth_mask)];
     if (truth) decide(m, r, n, n, truth);
   }
-  if (!g->foreseen && !cut) return;
+  if (!g->early && !cut) return;
   for (int32_t i = g->first + g->count - 1; i >= g->first; --i) { /* what was known of instants without room or samples */
     const node *o = m->t->nodes + i;
     if (!(o->flags & AHEAD)) continue;

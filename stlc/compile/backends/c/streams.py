@@ -148,7 +148,7 @@ class Node:
         return self.delay - self.far
 
     @property
-    def foreseen(self) -> bool:
+    def early(self) -> bool:
         """True if its truth at an instant may be known before the samples up to there."""
         return self.lasts or self.ahead > 0 or self.far < 0 or isinstance(self.form, ir.Shift)
 
@@ -291,7 +291,7 @@ class Graph:
                     lo, hi = steps, _TRUTHS[outside]
             flags = _DUAL * node.dual | _WEAK * getattr(form, "weak", False)
             flags |= _UNCUT * isinstance(form, Lasting) | _ENDLESS * node.endless
-            flags |= _LASTS * node.lasts | _ROOT * (node is self.root) | _AHEAD * node.foreseen
+            flags |= _LASTS * node.lasts | _ROOT * (node is self.root) | _AHEAD * node.early
             operands = out.add("operands", *(arg.read(first, node.since) for arg in node.args))
             readers = out.add("readers", *((first + reader.index,) for reader in node.readers))
             rows, kept = node.rows, _ring(node.kept + 1)
@@ -320,8 +320,8 @@ class Graph:
         if len(entries) > _ENTRIES:
             raise Untranslatable("too many operators around windows to the end")
         state = (out.room("spans", spans * (1 + cut)), spans, out.room("ints", ints * (1 + cut)), ints)
-        foreseen = sum(node.foreseen for node in self.nodes)
-        return out.add("graphs", (*shape, self.lag, self.far, foreseen, *to_end, *state))
+        early = sum(node.early for node in self.nodes)
+        return out.add("graphs", (*shape, self.lag, self.far, early, *to_end, *state))
 
     def _entries(self, first: int, out: Streams) -> list[Row]:
         """Parts of a formula with windows to the end, operands first."""
