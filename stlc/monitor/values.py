@@ -39,6 +39,7 @@ class Record:
         semantics: definition of minimum and maximum.
         holes: names of the signals with unknown values (`stlc.compile.ir.holes`).
         computed: whether NaN that a function gives outside of its domain is unknown too.
+        infinite: whether signals contain infinities, of which any function may give NaN.
         cells: recorded values between the samples, if the signals were resampled.
         loose: whether a step of the grid counts as a whole: windows end at an instant of their own.
     """
@@ -48,6 +49,7 @@ class Record:
     semantics: Semantics = Exact()  # noqa: RUF009 - frozen
     holes: frozenset[str] = frozenset()
     computed: bool = False
+    infinite: bool = False
     cells: Cells | None = None
     loose: bool = False
 
@@ -59,14 +61,17 @@ class Record:
         semantics: Semantics | None = None,
     ) -> Record:
         """Return a record of the signals `env`; in NumPy arrays, NaN is an unknown value."""
-        holes = holes_in(env) if ops is NUMPY else frozenset[str]()
+        semantics = semantics or Exact()
+        if ops is not NUMPY:
+            return Record(env, ops, semantics, cells=cells)
+        holes, infinite = holes_in(env), any(np.isinf(values).any() for values in env.values())
         filled = without_holes(env, holes) if holes else env
-        return Record(filled, ops, semantics or Exact(), holes, computed=ops is NUMPY, cells=cells)
+        return Record(filled, ops, semantics, holes, computed=True, infinite=infinite, cells=cells)
 
     @property
     def sure(self) -> Record:
         """Copy without unknown values, for formulas that account for them themselves (`sides`)."""
-        return replace(self, holes=frozenset(), computed=False, cells=None)
+        return replace(self, holes=frozenset(), computed=False, infinite=False, cells=None)
 
     def of_cells(self, formula: ir.Formula, *, loose: bool) -> Record:
         """Copy in which every recorded sample counts for `formula`; signals are intervals for a `freeze`."""
@@ -88,9 +93,10 @@ class Record:
         """
         if self.cells is not None and self.semantics.exact:
             return self.cells.sides(formula, cast("dict[str, Array]", self.env), loose=self.loose)
-        if not self.holes and not (self.computed and partial(formula)):
+        if not self.holes and not (self.computed and (self.infinite or partial(formula))):
             return formula, formula
-        least, most = (unsure(formula, self.holes, least=x, computed=self.computed) for x in (True, False))
+        may = {"computed": self.computed, "infinite": self.infinite}
+        least, most = (unsure(formula, self.holes, least=x, **may) for x in (True, False))
         return (formula, formula) if least == most else (least, most)
 
     @property

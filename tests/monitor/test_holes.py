@@ -131,6 +131,33 @@ def test_infinite_values_are_known() -> None:
     assert online.gaps["x"].samples == 1
 
 
+@pytest.mark.parametrize(
+    ("formula", "bounds"),
+    [
+        ("always a - b > 3", (-np.inf, -4.0)),
+        ("always abs(a - b) < 9", (-np.inf, 8.0)),
+        ("eventually a < b", (1.0, np.inf)),
+        ("0 <= a < b", (-np.inf, np.inf)),
+        ("a < (if a - b > 1 then 1 else 2)", (-np.inf, np.inf)),
+        ("always[0 s, 0.1 s] ind(a > b) == 1", (-np.inf, -0.5)),
+        ("freeze z = a in always b - z < 2", (-np.inf, np.inf)),
+    ],
+)
+@pytest.mark.parametrize("tolerance", [1e-6, 0.0])
+def test_the_difference_of_infinities_is_unknown(
+    formula: str, bounds: tuple[float, float], tolerance: float
+) -> None:
+    monitor = Monitor(f"signal a\nsignal b\nrequire r: {formula}", dt=0.1)
+    trace = {"a": np.array([np.inf, 1.0]), "b": np.array([np.inf, 2.0])}
+    judged, online = monitor.check(trace, tolerance=tolerance)["r"], monitor.online(How(tolerance=tolerance))
+    online.feed(trace)
+    tally = online.finish()["r"]
+    assert judged.bounds == (tally.low, tally.high) == bounds
+    low, high = bounds
+    wanted = "violated" if high < 0 else "satisfied" if low > 0 else "inconclusive"
+    assert judged.status == tally.status == wanted
+
+
 COMPUTED = {
     "eventually": "eventually R > 1.5",
     "always": "always[0 s, 0.3 s] (R < 2 or b > 0)",

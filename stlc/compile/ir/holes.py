@@ -1,9 +1,9 @@
 """Bounds on the robustness of a formula on a trace with unknown values.
 
 An unknown sample is NaN in the arrays. A function outside of its domain, such as `sqrt(-1)` or `0 / 0`, is
-NaN too. A predicate that reads such a value counts as -inf in the lower bound, and as +inf in the upper
-bound. The robustness of a formula never falls if the value of a predicate rises. Therefore a verdict that
-follows from the bounds is true for all values that are possible in these places.
+NaN too, and so is `inf - inf`. A predicate that reads such a value counts as -inf in the lower bound, and as
++inf in the upper bound. The robustness of a formula never falls if the value of a predicate rises. Therefore
+a verdict that follows from the bounds is true for all values that are possible in these places.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ KNOWN = "@known "
 """Prefix of the column that is 1 where the signal of that name is known, else -1."""
 
 _NAN = ir.Const(math.nan)
+_INFINITE = "@infinite"
+"""Stands among the values that may be NaN for the result of any function: signals are infinite."""
 
 
 def holes_in(env: Mapping[str, Floats]) -> Names:
@@ -55,7 +57,9 @@ def partial(formula: ir.Formula) -> bool:
 
 
 @lru_cache(maxsize=512)
-def unsure(formula: ir.Formula, holes: Names, *, least: bool, computed: bool = True) -> ir.Formula:
+def unsure(
+    formula: ir.Formula, holes: Names, *, least: bool, computed: bool = True, infinite: bool = False
+) -> ir.Formula:
     """Return a formula whose value is a bound on `formula` for all values that are unknown.
 
     Args:
@@ -63,12 +67,14 @@ def unsure(formula: ir.Formula, holes: Names, *, least: bool, computed: bool = T
         holes: names of the signals with unknown values; names under which a `freeze` stores them are added.
         least: True for the lower bound, False for the upper bound.
         computed: whether NaN that a function gives outside of its domain is unknown too.
+        infinite: whether signals may be infinite, so that any function may give NaN, as `inf - inf` does.
     """
-    return _unsure(formula, holes, frozenset() if computed else None, least=least)
+    nans = frozenset({_INFINITE} if infinite else ()) if computed else None
+    return _unsure(formula, holes, nans, least=least)
 
 
 def _unsure(formula: ir.Formula, holes: Names, nans: Names | None, *, least: bool) -> ir.Formula:
-    """`nans` are the frozen values that may be NaN; None if computed NaN does not count as unknown."""
+    """`nans` are the frozen values that may be NaN (see `_INFINITE`); None if computed NaN is not unknown."""
     match formula:
         case ir.Predicate(num=num):
             atom, known = formula, _known(num, holes)
@@ -111,7 +117,7 @@ def _known(num: ir.Num, holes: Names) -> ir.Num | None:
 def _is_partial(num: ir.Num, nans: Names) -> bool:
     """True if a number may depend on NaN although its signals are known; `nans` are such frozen values."""
     return any(
-        (isinstance(part, ir.Op) and not has_value(part))
+        (isinstance(part, ir.Op) and (_INFINITE in nans or not has_value(part)))
         or (isinstance(part, ir.FrozenVar) and part.name in nans)
         or (isinstance(part, ir.Extern) and _returns_nan(part))
         for part in num.subexpressions()

@@ -308,7 +308,8 @@ def _evidence(rule: CompiledRequirement, subject: Prepared, part: Part, trace: i
     times = None
     if given.cells is None:
         env = {name: column[:, trace : trace + 1] for name, column in given.env.items()}
-        record = Record(env, given.ops, holes=given.holes, computed=given.computed)
+        sure = Record(env, given.ops)
+        record = replace(sure, holes=given.holes, computed=given.computed, infinite=given.infinite)
     else:
         env, times = given.cells.of_trace(trace).witness(rule.formula)
         record = Record.of(env, given.ops)

@@ -70,6 +70,10 @@ static inline span most(span a, span b) {
   return spanned(b.lo > a.lo ? b.lo : a.lo, b.hi > a.hi ? b.hi : a.hi);
 }
 static inline span pick(span a, span b, int dual) { return dual ? least(a, b) : most(a, b); }
+/* Margin of a comparison that only holds or not; NaN where its own is. */
+static inline real gated(real margin, int strict) {
+  return margin != margin ? margin : (strict ? margin > 0 : margin >= 0) ? INF : -INF;
+}
 static inline at later(at a, at b) { return a > b ? a : b; }
 static inline at sooner(at a, at b) { return a < b ? a : b; }
 

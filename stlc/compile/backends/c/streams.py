@@ -366,13 +366,15 @@ static void predicates_{number}(const samples *x, at n, int mode, int clip, span
 
         reads = {place(leaf) for leaf in atom.num.leaves() if isinstance(leaf, (ir.Signal, ir.ShiftedSignal))}
         known = " && ".join(f"{text} == {text}" for text in sorted(filter(None, reads - {"(real)t"}))) or "1"
+        chooses = any(isinstance(part, (ir.Where, ir.Indicator)) for part in atom.num.subexpressions())
         sides = []
         for least in (True, False):
-            writer, bounded = NumberWriter(place), unsure(atom, frozenset(), least=least)
+            writer = NumberWriter(place)
+            bounded = unsure(atom, frozenset(), least=least, infinite=chooses)  # elsewhere NaN is seen
             assert isinstance(bounded, ir.Predicate)
             value = writer.number(bounded.num) if atom.sign > 0 else f"-{writer.number(bounded.num)}"
             if atom.guard:
-                value = f"{value} {'>' if atom.strict else '>='} 0 ? INF : -INF"
+                value = f"gated({value}, {int(atom.strict)})"
             sides.append([*writer.lines, f"out.{'lo' if least else 'hi'} = {value};"])
         (*first, low), (*second, high) = sides
         body = [*first, low, high] if first == second else ["{", *first, low, "}", "{", *second, high, "}"]
@@ -383,7 +385,8 @@ static void predicates_{number}(const samples *x, at n, int mode, int clip, span
     span out = spanned(-INF, INF);
     if (t >= {near.past} && t + (mode >= ENDED ? {near.future} : {far.future}) < x->known) {{
       if ({known}) {{
-{values}      }}
+{values}        if (!(out.lo <= out.hi)) out = spanned(-INF, INF); /* NaN, as of inf - inf */
+      }}
     }} else if (clip) {{
       out = certain({int(atom.sign < 0)});
     }}
