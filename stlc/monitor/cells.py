@@ -202,6 +202,11 @@ class Cells:
             found[name] = Intervals(low, high)
         return found
 
+    def last(self, cell: int) -> float:
+        """Time of the last moment of a cell in seconds."""
+        following = [*self.starts.tolist(), len(self.times)][cell + 1]
+        return float(self.times[following - 1])
+
     def interval_env(self) -> tuple[dict[str, Array], frozenset[str]]:
         """Signals as intervals without NaN, and the names of those that are unknown somewhere."""
         hulls = self.hulls()

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.backends.array.graph import robustness_signal
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.schedule import Boundary
 from stlc.compile.ir.defined import defined_at
 from stlc.compile.ir.discretize import Grid
@@ -81,8 +80,6 @@ def rule_bounds(
     found = _cut_bounds(rule, record, starts, horizon, ends)
     if ends == "open" or not (outside := beyond(rule, starts, record.samples, horizon)).any():
         return found
-    if record.cells is not None or record.ops is not NUMPY:
-        return widened(outside, found, rule_bounds(rule, record, starts, horizon, "open"))
     return widened(outside, found, live_bounds(rule, record, starts, horizon, ends))
 
 
@@ -95,20 +92,20 @@ def live_bounds(
     if known := range(starts.start, min(settled, starts.stop)):
         parts.append(_cut_bounds(rule, record, known, horizon, ends))
     if rest := range(known.stop, starts.stop):
-        formula, grown = rule.under(record.semantics), replace(record, env=with_seen(record.env))
-        lower, upper = (prefix_bound(formula, end, cut=cut) for end in ("lower", "upper"))
+        formula, grown = rule.under(record.semantics), record.sure
+        grown = replace(grown, env=with_seen(grown.env, grown.ops))
+        least, most = record.sides(formula)
+        least, most = prefix_bound(least, "lower", cut=cut), prefix_bound(most, "upper", cut=cut)
         if window is None:
-            least, most = (lengthened(each, record.samples) for each in (lower, upper))
-            (low,) = grown.values([grown.sides(least)[0]], rest, "lower", FAR)
-            (high,) = grown.values([grown.sides(most)[1]], rest, "upper", FAR)
+            (low,) = grown.values([lengthened(least, record.samples)], rest, "lower", FAR)
+            (high,) = grown.values([lengthened(most, record.samples)], rest, "upper", FAR)
         elif cut:
-            low, high = (
-                window_bounds(each, grown, rest, window, "open")[i] for i, each in enumerate((lower, upper))
-            )
+            low = window_bounds(least, grown, rest, window, "open")[0]
+            high = window_bounds(most, grown, rest, window, "open")[1]
         else:
-            low, high = window_bounds(formula, grown, rest, window, "open")
+            low, high = window_bounds(formula, record, rest, window, "open")
         parts.append((low, high))
-    low, high = (np.concatenate(each) for each in zip(*parts, strict=True))
+    low, high = (record.ops.cat(each) for each in zip(*parts, strict=True))
     return low, high
 
 

@@ -16,10 +16,8 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from stlc.compile.ir import nodes as ir
+from stlc.compile.namespace import Array, Ops
 
 FAR = 1 << 40
 """More samples than any trace has."""
@@ -63,9 +61,10 @@ def prefix_bound(formula: ir.Formula, end: Literal["lower", "upper"], *, cut: bo
     return bound(formula)
 
 
-def with_seen(signals: Mapping[str, NDArray[np.float64]]) -> Mapping[str, NDArray[np.float64]]:
+def with_seen(signals: Mapping[str, Array], ops: Ops) -> Mapping[str, Array]:
     """Return the signals (samples, traces), and the additional signal `SEEN`, which is 1 at every sample."""
-    return {**signals, SEEN: np.broadcast_to(1.0, next(iter(signals.values())).shape)}
+    like = next(iter(signals.values()))
+    return {**signals, SEEN: ops.full(like.shape, 1.0, like)}
 
 
 def lengthened(formula: ir.Formula, samples: int) -> ir.Formula:

@@ -33,6 +33,7 @@ from stlc.monitor.grid import Times, agreed_times, given_times, named_times, req
 from stlc.monitor.instants import (
     At,
     check_length,
+    live_bounds,
     rule_at,
     rule_bounds,
     rule_known,
@@ -167,10 +168,7 @@ class Monitor:
         if uncertain and not reported.exact:
             raise usage("uncertain signals have bounds in exact semantics only")
         ready = self._prepare(signals, require, plain=True)
-        judged = ready
-        if uncertain:
-            rules = (*ready.rules, *ready.compiled.assumptions)
-            judged = replace(ready, record=uncertain_record(ready.record, uncertain, ready.compiled, rules))
+        judged = _under(ready, uncertain or {})
         where = []
         for rule in ready.rules:
             part = Part(0, ready.record.samples) if strict else ready.part(rule)
@@ -488,28 +486,40 @@ def _judge(
     return RequirementVerdict(rule, start, low, high, holds, fails, *where, subject=ready)
 
 
-def first_violation(judgement: RequirementVerdict) -> int:
+def _under(ready: Prepared, uncertain: Uncertainties) -> Prepared:
+    """The signals with the greatest errors of their samples."""
+    if not uncertain:
+        return ready
+    rules = (*ready.rules, *ready.compiled.assumptions)
+    return replace(ready, record=uncertain_record(ready.record, uncertain, ready.compiled, rules))
+
+
+def first_violation(judgement: RequirementVerdict, uncertain: Uncertainties | None = None) -> int:
     """Return the sample from which a violated requirement is certainly violated, whatever follows.
 
     An online monitor reports the violation at this sample; if the end of the trace decides, it is the last.
     It is found by bisection, since a prefix that certainly violates a requirement does so however it goes on.
     """
-    subject, part = judgement.subject, judgement.part
-    assert subject is not None
+    assert judgement.subject is not None
+    subject, part = _under(judgement.subject, uncertain or {}), judgement.part
     start, first = judgement.start, part.first
+    rule = decisive(judgement.rule, judgement.tolerance, subject.compiled.signature)
 
     def violated(stop: int) -> bool:
         starts = range(start - first, min(start + judgement.instants, stop) - first)
-        shorter = replace(part, stop=stop)
-        fails = _judge(judgement.rule, subject, starts, "open", judgement.tolerance, shorter).fails
-        return bool(judgement.counted(fails).any())
+        record = record_of(rule, subject, replace(part, stop=stop))
+        most = outer(*live_bounds(rule, record, starts, subject.horizon, judgement.ends))[1]
+        return bool(judgement.counted(TOLERANCE.violated(most, judgement.tolerance)).any())
 
     return bisect_left(range(part.stop), True, lo=start + 1, key=violated) - 1
 
 
 def timed(verdict: Verdict) -> Verdict:
     """Return the verdict with the times from which requirements are certainly violated; see `violated_at`."""
-    found = {each.name: each.timeline.time(first_violation(each)) for each in verdict.violated}
+    found, cells = {}, verdict.subject.record.cells
+    for each in verdict.violated:
+        first = first_violation(each, verdict.uncertain)
+        found[each.name] = each.timeline.time(first) if cells is None else cells.last(first)
     return replace(
         verdict,
         requirements=tuple(replace(each, violated_at=found.get(each.name)) for each in verdict),

@@ -32,7 +32,7 @@ def at_ends(
     formula: ir.Formula, known: dict[str, np.ndarray], starts: range, *, cut: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Bounds wherever the trace ends, by the evaluator: endless windows run over many unknown samples."""
-    record = Record(with_seen(known), NUMPY)
+    record = Record(with_seen(known, NUMPY), NUMPY)
     low, high = (
         record.values(
             [lengthened(prefix_bound(formula, end, cut=cut), record.samples + 60)], starts, end, FAR

@@ -40,7 +40,7 @@ def compiled() -> Compiled:
 
 def at_ends(formula: ir.Formula, known: dict[str, np.ndarray], starts: range, *, cut: bool = False) -> Ends:
     """Bounds wherever the trace ends, by the evaluator: endless windows run over many unknown samples."""
-    record, found = Record.of(with_seen(known), NUMPY), []
+    record, found = Record.of(with_seen(known, NUMPY), NUMPY), []
     for i, end in enumerate(("lower", "upper")):
         longer = lengthened(prefix_bound(formula, end, cut=cut), record.samples + 60)
         found.append(record.values([record.sides(longer)[i]], starts, end, FAR)[0][:, 0])

@@ -20,12 +20,14 @@ from stlc.cli.commands.check.many import Work, safe_outcomes
 from stlc.cli.commands.check.table import COLUMNS
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
+from stlc.compile.semantics.tolerance import End
 from stlc.controller.parallel.elsewhere import RemoteCall, answer
 from stlc.controller.parallel.workers import CallFiles
 from stlc.jsontext import plain
 from stlc.monitor.check import Question
 from stlc.monitor.online.online import How
-from stlc.monitor.verdict import Monitor, first_violation
+from stlc.monitor.uncertain import Uncertainty
+from stlc.monitor.verdict import Monitor, first_violation, timed
 from stlc.trace import Trace
 
 SPEC = """spec small
@@ -271,6 +273,39 @@ def test_the_first_violation_is_the_one_that_an_online_monitor_reports(seed: int
                 first.setdefault(decision.requirement, decision.sample)
     found = {j.name: first_violation(j) for j in verdict if j.overall == "violated"}
     assert found == first
+
+
+@pytest.mark.parametrize("end", ["open", "truncate"])
+@pytest.mark.parametrize(
+    ("written", "first"),
+    [
+        ("eventually x > 0", 3),
+        ("x < 0 until x > 0", 3),
+        ("always (x < -1 -> eventually x > 0)", 3),
+        ("always x > -1.5", 1),
+        ("eventually[0, 1] x > 0", 1),
+    ],
+)
+def test_a_violation_that_the_end_decides_is_certain_at_the_end(written: str, first: int, end: End) -> None:
+    monitor = Monitor(f"signal x\nrequire r: {written}", dt=1)
+    x = np.array([-1.0, -2, -1, -1])
+    uncertain = {"x": Uncertainty(0.0)}
+    assert first_violation(monitor.check({"x": x}, end=end)["r"]) == first
+    assert timed(monitor.check({"x": x}, end=end, uncertain=uncertain))["r"].violated_at == first
+
+
+def test_an_uncertain_violation_is_certain_where_no_error_hides_it() -> None:
+    monitor = Monitor("signal x\nrequire r: always x > 0", dt=1)
+    verdict = monitor.check({"x": np.array([1.0, -1, -3])}, uncertain={"x": Uncertainty(2.0)})
+    assert timed(verdict)["r"].violated_at == 2.0
+
+
+@pytest.mark.parametrize(("written", "at"), [("always x > 0", "1.5"), ("eventually x > 9", "3.0")])
+def test_a_violation_within_a_step_is_not_certain_before_it(written: str, at: str) -> None:
+    Path("within.csv").write_text("t,x\n0,1\n1,1\n1.5,-1\n2,1\n3,1\n")
+    Path("within.stl").write_text(f"signal x\nrequire r: {written}\n")
+    assert main(["check", "within.stl", "within.csv", "--resample", "1s", "--table", "t.csv", "-q"]) == 1
+    assert [row["violated_at"] for row in rows_of("t.csv")] == [at]
 
 
 @pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
