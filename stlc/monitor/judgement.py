@@ -280,15 +280,19 @@ class RequirementVerdict:
 
     @property
     def worst(self) -> tuple[int, int]:
-        """Trace and sample with the least `high` if the requirement is violated, else the least `low`."""
+        """Trace and sample of the violation with the least `high`; without one, those of the least `low`."""
         violated = bool(self.counted(self.fails).any())
-        values = self.high if violated else self.low
+        values = self._violating if violated else self.low
         if self.scope is not None and self.scope.any():
             values = np.where(self.scope, values, np.inf)
         instant, trace = (int(each) for each in np.unravel_index(int(np.argmin(values)), values.shape))
         if self.counts is None:
             return trace, self.start + instant
         return trace, int((self.counts.high_at if violated else self.counts.low_at)[trace])
+
+    @property
+    def _violating(self) -> Floats:
+        return np.where(self.fails, self.high, np.inf)
 
     @cached_property
     def cause(self) -> Cause | None:
@@ -330,7 +334,7 @@ class RequirementVerdict:
     def told(self, facts: Iterable[Fact], *, cause: bool) -> RequirementVerdict:
         """Return the verdict without signals and instants, but with facts and, if asked for, its cause."""
         low, high = (None, None) if self.reported is None else self.reported
-        at = (self.start + end.argmin(axis=0) for end in (self.low, self.high))
+        at = (self.start + end.argmin(axis=0) for end in (self.low, self._violating))
         made = replace(
             self,
             low=_lowest(self.low),

@@ -17,7 +17,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import typed
 from stlc.diagnostics import UsageError
 from stlc.monitor.explain.causes import CauseFinder, CauseNode
-from stlc.monitor.explain.report import explain, names_in, shown
+from stlc.monitor.explain.report import explain, names_in, shown, violations
 from stlc.monitor.online.online import How
 from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
@@ -102,9 +102,9 @@ def test_an_operator_that_never_succeeds_is_explained_by_its_best(
     tree = CauseFinder(Record(env, NUMPY), GRID).blame(formula, 0)
     for node in nodes(tree):
         match node:
-            case CauseNode(formula=typed.Temporal(body=body), parts=(CauseNode(during=range()) as best,)):
-                wanted = not node.holds
-                ends = [judge.at(body, k, wanted) for k in best.during or ()]
+            case CauseNode(parts=(CauseNode(during=range()) as best,)):
+                wanted = not best.holds
+                ends = [judge.at(best.formula, k, wanted) for k in best.during or ()]
                 margins = [end[1] if wanted else -end[0] for end in ends if end is not None]
                 assert -abs(best.rho) == pytest.approx(max(margins))
 
@@ -210,6 +210,83 @@ def test_a_window_that_the_end_cuts_is_explained_at_the_end() -> None:
     for found in (cause, online.cause("r")):
         assert found is not None
         assert (found.because, found.sample) == ("`y > 0` comes closest at t = 8 s, where y = -1", 8)
+
+
+@pytest.mark.parametrize(
+    ("written", "end", "spans"),
+    [
+        ("always (x > 0 -> eventually[0, 2] y > 0)", "truncate", [(3, 4), (8, 8)]),
+        ("always (x > 0 -> eventually[0, 2] y > 0)", "open", [(3, 4)]),
+        ("always[0, 1] always@[0, 3] x > 0", "open", [(2, 2)]),
+        ("always@[4, 4] always@[1, 2] x > 0", "open", [(2, 2)]),
+    ],
+)
+def test_marks_are_at_the_instants_that_count(written: str, end: str, spans: list[tuple[int, int]]) -> None:
+    x, y = [1.0, 1, -1, 1, 1, 0, 0, 0, 1], [0.0, 1, -1, -9, -1, -1, -1, 1, -1]
+    verdict = Monitor(f"signal x, y\nrequire r: {written}", dt=1).check(
+        {"x": np.array(x), "y": np.array(y)}, end=end
+    )
+    assert [(each.first, each.last) for each in violations(verdict, "r", 0, 9)] == spans
+
+
+def test_a_value_that_a_cut_window_needs_too_does_not_decide_alone() -> None:
+    monitor = Monitor("signal x\nrequire r: always[0, 3] eventually[0, 1] x > 0", dt=1)
+    cause = explain(monitor.check({"x": np.array([1.0, 1, -1, -1])}, end="truncate"), "r")
+    assert cause is not None
+    assert (cause.sample, cause.alone) == (3, True)
+
+
+def test_an_absolute_window_is_violated_where_it_is_required() -> None:
+    monitor = Monitor("signal x\nrequire r: always[1, 3] eventually@[0, 0] x > 0", dt=1)
+    cause = explain(monitor.check({"x": -np.ones(5)}), "r")
+    assert cause is not None
+    assert (cause.sample, cause.violated) == (0, 1)
+
+
+def test_what_comes_closest_is_closest_in_the_whole_window() -> None:
+    monitor = Monitor("signal x, y\nrequire r: x > 0 until[0, 2] y > 0", dt=1)
+    cause = explain(monitor.check({"x": np.array([1.0, -9, 1]), "y": np.array([-5.0, -1, -1])}), "r")
+    assert cause is not None
+    assert cause.because == "`y > 0` is false where y = -5, at t = 0 s"
+
+
+def test_an_unknown_sample_has_no_value() -> None:
+    monitor = Monitor("signal x, y\nrequire r: x <= prev(x)", dt=1)
+    cause = explain(monitor.check({"x": np.array([np.nan, 2.0])}, end="truncate"), "r")
+    assert cause is not None
+    assert cause.because == "`x <= prev(x)` is false whatever the signals are"
+
+
+@pytest.mark.parametrize(
+    ("written", "because", "spans"),
+    [
+        ("x >= 0 and y > 0", "`y > 0` is false where y = 0, at t = 0 s", [(0, 0)]),
+        ("always (y > 0 or x < 0)", "`y > 0` is false where y = 0, at t = 0 s", [(0, 0), (2, 2)]),
+        ("always not x >= 0", "`x >= 0` is true where x = 0, at t = 0 s", [(0, 0), (2, 2)]),
+    ],
+)
+def test_without_tolerance_what_is_blamed_is_false(
+    written: str, because: str, spans: list[tuple[int, int]]
+) -> None:
+    monitor = Monitor(f"signal x, y\nrequire r: {written}", dt=1)
+    columns = {"x": np.array([0.0, -1, 0]), "y": np.array([0.0, 0, 0])}
+    verdict = monitor.check(columns, tolerance=0)
+    online = monitor.online(How(tolerance=0, reasons=True))
+    online.feed(columns)
+    for cause in (explain(verdict, "r"), online.cause("r")):
+        assert cause is not None
+        assert (cause.because, cause.tree.rho) == (because, 0.0)
+    assert [(each.first, each.last) for each in violations(verdict, "r", 0, 9)] == spans
+
+
+def test_without_tolerance_the_worst_start_is_a_violated_one() -> None:
+    verdict = Monitor("signal x, y\nrequire r: x >= 0 and y > 0", dt=1).check(
+        {"x": np.array([0.0, 1, 2]), "y": np.array([1.0, 0, 1])}, at="all", tolerance=0
+    )
+    cause = explain(verdict, "r")
+    assert cause is not None
+    assert cause.because == "`y > 0` is false where y = 0, at t = 1 s"
+    assert verdict.told()["r"].worst == (0, 1)
 
 
 def test_a_planning_window_that_the_end_cuts_is_explained_in_the_recording() -> None:

@@ -47,6 +47,9 @@ _MOST_NUMBERS = 1 << 26
 _SMALL = 1e-7
 """Relative change of a signal, to see whether the value of a predicate moves with it."""
 
+_FALSE = -1e-300
+"""Margin of a predicate that is false with the margin 0, if truth values decide."""
+
 _MOST_LATER = 64
 """Greatest number of instants after the last sample at which past operators are still evaluated."""
 
@@ -219,6 +222,7 @@ class CauseFinder:
         known: lowered formula -> list of pairs (range of instants, upper bounds on the robustness at them).
         tied: predicate values, one of them slightly increased, on which formulas are then evaluated.
         stop: number of samples that the complete trace would have, if the recording is shorter; else None.
+        exact: whether truth values decide, so that `x > 0` is false at 0: the tolerance is 0.
         frozen: values of the enclosing `freeze` operators.
     """
 
@@ -229,6 +233,7 @@ class CauseFinder:
     known: dict[ir.Formula, list[tuple[range, Floats]]] = field(default_factory=dict)
     tied: _Tied | None = None
     stop: int | None = None
+    exact: bool = False
     frozen: Mapping[str, FrozenValue] = field(default_factory=dict)
 
     def why(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> tuple[CauseNode, bool]:
@@ -307,6 +312,7 @@ class CauseFinder:
     def blame(self, formula: typed.Formula, sample: int, wanted: bool = True) -> CauseNode:
         """Return the tree that explains why `formula` does not have the truth value `wanted` at `sample`."""
         margin = self._margin(formula, sample, wanted)
+        margin = 0.0 if margin == _FALSE else margin
         node = CauseNode(formula, not wanted, sample, margin if wanted else -margin)
         match formula:
             case typed.Predicate():
@@ -318,7 +324,7 @@ class CauseFinder:
             case typed.Logic():
                 found = self._logic(node, formula)
             case _ if formula.on_clock:
-                found = replace(self.blame(formula.from_now(), 0, wanted), formula=formula)
+                found = replace(self.blame(formula.from_now(), 0, wanted), formula=formula, sample=sample)
             case typed.Temporal():
                 found = self._temporal(node, formula)
             case typed.Until(_, "unless"):
@@ -354,8 +360,8 @@ class CauseFinder:
             case typed.Not(_, body):
                 yield from self.violations(body, instants, wanted=not wanted)
             case typed.Temporal(_, op, _, body) if op == ("always" if wanted else "eventually"):
-                here = formula.from_now() if formula.on_clock else formula
-                windows = [self._instants(self._lowered(here, wanted), int(k)) for k in instants]
+                here, starts = (formula.from_now(), [0]) if formula.on_clock else (formula, instants.tolist())
+                windows = [self._instants(self._lowered(here, wanted), k) for k in starts]
                 edges = np.zeros(max((each.stop for each in windows), default=0) + 1, np.int64)
                 for window in windows:
                     if window:
@@ -379,8 +385,9 @@ class CauseFinder:
         if len(instants):
             span = range(int(instants[0]), int(instants[-1]) + 1)
             margins = self._margins(formula, wanted, span)[instants - span.start]
-            if TOLERANCE.violated(margins).any():
-                yield from self.violations(formula, instants[TOLERANCE.violated(margins)], wanted=wanted)
+            fails = TOLERANCE.violated(margins, 0.0 if self.exact else None)
+            if fails.any():
+                yield from self.violations(formula, instants[fails], wanted=wanted)
 
     def _lowered(self, formula: typed.Formula, wanted: bool) -> ir.Formula:
         """Return the formula with basic operators and intervals in samples, negated if `wanted` is False.
@@ -392,7 +399,7 @@ class CauseFinder:
             goal = formula if wanted else typed.Not(formula.span, formula)
             bound = {key: kept.num for key, kept in self.frozen.items()}
             substituted = self.grid.lower(goal, []).substitute_frozen(bound)
-            given = assume_missing_true(substituted, self.record.env)
+            given = assume_missing_true(_strict(substituted) if self.exact else substituted, self.record.env)
             self.cache[key] = self.record.sides(given)[1]
         return self.cache[key]
 
@@ -570,8 +577,9 @@ class CauseFinder:
             failed = self.blame(formula.right, sample + way * met, wanted)
             return replace(node, parts=(freed, failed), main=main)
         offset, is_left = _unmet(left, right)
-        part = self.blame(formula.left if is_left else formula.right, sample + way * offset, wanted)
-        if not (is_left or beyond or (right >= 0).any()):
+        there = sample + way * offset
+        part = self.blame(formula.left if is_left else formula.right, there, wanted)
+        if not (is_left or beyond) and self._margin(formula.right, there, wanted) == right.max() < 0:
             part = _throughout(part, instants)
         return replace(node, parts=(part,))
 
@@ -583,6 +591,14 @@ def _throughout(node: CauseNode, instants: range) -> CauseNode:
     negated = node.formula.word == "not" and len(node.parts) == 1
     parts = (_throughout(node.parts[0], instants),) if negated else node.parts
     return replace(node, during=instants, parts=parts)
+
+
+def _strict(formula: ir.Formula) -> ir.Formula:
+    """The formula with the margin `_FALSE` for every predicate that is false with the margin 0."""
+    if isinstance(formula, ir.Predicate):
+        least = ir.Op("add", (formula.num, ir.Const(formula.sign * _FALSE)))
+        return replace(formula, num=least) if formula.strict else formula
+    return formula.map_children(formulas=_strict)
 
 
 def _is_written_predicate(formula: typed.Formula) -> bool:

@@ -12,14 +12,16 @@ from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.holes import KNOWN
 from stlc.compile.pipeline import CompiledRequirement
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.grammar import ast
 from stlc.jsontext import Num
 from stlc.monitor.explain.causes import CauseFinder, CauseNode, Violations
-from stlc.monitor.instants import rule_bounds, window_of
+from stlc.monitor.instants import beyond, rule_bounds, window_of
 from stlc.monitor.judgement import RequirementVerdict, Verdict
-from stlc.monitor.prepared import Floats, Part, Prepared, Timeline
-from stlc.monitor.values import Ends, Record
+from stlc.monitor.prepared import Part, Prepared, Timeline
+from stlc.monitor.values import Record, decisive
 from stlc.signature import Column
 from stlc.source import Label, Span
 
@@ -251,28 +253,28 @@ class _JudgedTrace:
 
     def shows(self, start: int) -> bool:
         """True if the samples show the violation at `start`; of several in a step, one was chosen."""
-        if self.subject.signals.times is None:
+        tolerance, subject, starts = self.judgement.tolerance, self.subject, range(start, start + 1)
+        if subject.signals.times is None and tolerance:
             return True
-        return bool(self.greatest(range(start, start + 1), self.judgement.ends)[0] < 0.0)
-
-    def greatest(self, starts: range, ends: Ends) -> Floats:
-        """Upper bounds on the robustness at `starts`, (count,)."""
-        rule, record = self.judgement.rule, self.subject.record
-        return np.asarray(rule_bounds(rule, record, starts, self.subject.horizon, ends)[1].max(axis=1))
+        rule = decisive(self.judgement.rule, tolerance, subject.compiled.signature)
+        high = rule_bounds(rule, subject.record, starts, subject.horizon, self.judgement.ends)[1]
+        return TOLERANCE.violated(float(high.max()), tolerance)
 
     def cut(self, starts: range) -> NDArray[np.bool_]:
-        """Starts whose robustness depends on a window that the end cuts, (count,)."""
+        """Starts from which the end cuts windows, (count,); those of others lie beyond it."""
         if self.judgement.ends == "open":
             return np.zeros(len(starts), dtype=np.bool_)
-        return np.not_equal(*(self.greatest(starts, ends) for ends in ("truncate", "open")))
+        return ~beyond(self.judgement.rule, starts, self.subject.record.samples, self.subject.horizon)
 
     def finder(self, start: int, *, cut: bool) -> CauseFinder:
         record = self.subject.record
         stop = None if self.window is None else start + self.window + 1
         if stop is not None and stop <= record.samples:
             record, stop = record.cut(stop), None
-        grid = self.subject.compiled.grid
-        return CauseFinder(record, grid, "truncate") if cut else CauseFinder(record, grid, stop=stop)
+        grid, exact = self.subject.compiled.grid, not self.judgement.tolerance
+        if cut:
+            return CauseFinder(record, grid, "truncate", exact=exact)
+        return CauseFinder(record, grid, stop=stop, exact=exact)
 
     def cause(
         self, record: Record, start: int, tree: CauseNode, alone: bool, definitions: dict[str, ast.Expr]
@@ -431,6 +433,9 @@ def readings_of(leaf: CauseNode, subject: Prepared, samples: int) -> tuple[Signa
     for name, later in reads:
         sample = leaf.sample + later
         if name not in signature or not 0 <= sample < samples:
+            continue
+        known = env.get(KNOWN + name)
+        if known is not None and known[sample, 0] < 0.0:
             continue
         value = float(env[name][sample, 0])
         when = f" at {subject.moment(sample)}" if later else ""

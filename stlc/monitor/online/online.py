@@ -130,7 +130,8 @@ class Online:
         self._step = None if compiled.grid.dt is None else float(compiled.grid.dt)
         self._recomputed = [each for each in watched if isinstance(each, Recomputed)]
         self._gaps: dict[str, Gap] = {}
-        self._buffer = TraceBuffer(compiled, self.how.t0, self._ends) if self.how.reasons else None
+        buffer = TraceBuffer(compiled, self.how.t0, self._ends, self.how.tolerance)
+        self._buffer = buffer if self.how.reasons else None
         self._plain = self._kernel is not None and not self._recomputed and self._buffer is None
 
     def _ask(self, rule: CompiledRequirement, *, once: bool = False) -> Asked:

@@ -31,12 +31,14 @@ _MOST = 1 << 21
 class TraceBuffer:
     """Buffer of the latest samples of a stream, and of causes of violations.
 
-    `t0` is the time of the first sample in seconds, `ends` the treatment of windows beyond the end.
+    `t0` is the time of the first sample in seconds, `ends` the treatment of windows beyond the end; for
+    `tolerance` see `RequirementVerdict`.
     """
 
     compiled: Compiled
     t0: float
     ends: Ends
+    tolerance: float
     _history: ColumnHistory = field(default_factory=ColumnHistory)
     _found: dict[str, dict[tuple[int, float], Cause]] = field(default_factory=dict)
     _width: int = 1
@@ -75,7 +77,7 @@ class TraceBuffer:
         signals = Signals(env, (), record.samples, NUMPY, dt=step, t0=self.t0 + first * (step or 0.0))
         fails = np.ones((1, 1), dtype=np.bool_)
         subject, part = Prepared(self.compiled, (rule,), signals, record), Part(0, record.samples)
-        judged = (rule, start, low, high, ~fails, fails, (), part, subject.timeline)
+        judged = (rule, start, low, high, ~fails, fails, (), part, subject.timeline, self.tolerance)
         cause = cause_of(RequirementVerdict(*judged, ends=self.ends, subject=subject))
         if cause is None:
             return None
