@@ -21,6 +21,7 @@ from stlc.escape import c_comment, c_string
 from stlc.files import File, place
 from stlc.monitor.online.kernel import streamed_rule
 from stlc.monitor.online.online import How, Online
+from stlc.monitor.prefix_bounds import FAR
 from stlc.monitor.verdict import Monitor
 
 _LIBM = "|".join(
@@ -110,7 +111,7 @@ def _texts(online: Online, program: Streams, *, single: bool) -> tuple[dict[str,
         "NAME": name,
         "UPPER": name.upper(),
         "SPEC": c_comment(online.compiled.name),
-        "DT": "unknown" if dt is None else f"{float(dt):.17g} s",
+        "DT": "unknown" if dt is None else f"{float(dt)!r} s",
         "REAL": "float" if single else "double",
         "SIGNALS": len(online.signals),
         "REQUIREMENTS": len(online.asked),
@@ -143,13 +144,19 @@ class _Text(Template):
 def _about(online: Online) -> list[str]:
     """Lines of a comment about signals and requirements."""
     lines = ["   Signals, in the order of a sample:"]
-    units = {column.name: column.unit for column in online.compiled.signature.columns}
+    columns = {column.name: column for column in online.compiled.signature.columns}
     for i, name in enumerate(online.signals):
-        lines.append(f"     {i}  {c_comment(name)} {c_comment(str(units.get(name, '')))}".rstrip())
+        column = columns[name]
+        values = ", ".join(f"{value:g} {label}" for label, value in column.labels) or str(column.unit)
+        lines.append(f"     {i}  {c_comment(name)}: {c_comment(values)}")
     lines.append("   Requirements:")
     for i, each in enumerate(online.asked):
         where = "at every sample" if each.everywhere else f"at sample {each.begin}"
-        lines.append(f"     {i}  {c_comment(each.rule.name)}: {where}, known after {each.lag} samples more")
+        later = max(each.lag, each.span.future)
+        known = "at the end" if later >= FAR else f"after {later} samples more"
+        lines.append(f"     {i}  {c_comment(each.rule.name)}: {where}, known {known} at the latest")
+    if assumed := ", ".join(c_comment(each.name) for each in online.compiled.assumptions):
+        lines.append(f"   Not judged, as they are assumptions: {assumed}")
     return lines
 
 

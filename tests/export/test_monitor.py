@@ -135,6 +135,28 @@ def test_a_monitor_in_c_judges_at_every_sample(tmp_path: Path) -> None:
     assert [each.instants for each in tallies] == [37, 40]
 
 
+def test_the_header_says_what_values_mean_and_when_requirements_are_known(tmp_path: Path) -> None:
+    text = "spec demo\nenum Mode { off, fast = 7 }\nsignal x [m]\nsignal m : Mode\nassume begin: x > 0\n"
+    text += "require a: x < 9 until[0, 2 s] m == fast\nrequire b: always x < 9\nrequire c: once[0, 1 s] x > 3"
+    export_monitor(Monitor(text, dt=0.1), tmp_path)
+    head = (tmp_path / "demo_monitor.h").read_text()
+    assert "0  x: m\n     1  m: 0 off, 7 fast\n" in head
+    assert "a: at sample 0, known after 20 samples more" in head
+    assert "b: at sample 0, known at the end" in head
+    assert "c: at sample 0, known after 0 samples more" in head
+    assert "Not judged, as they are assumptions: begin\n   Time step: 0.1 s." in head
+
+
+@pytest.mark.parametrize(("cell", "code"), [(" 2 ", 0), ("", 0), ("nan", 0), ("fast", 2), ("2x", 2)])
+def test_what_is_no_number_is_not_taken_as_unknown(tmp_path: Path, cell: str, code: int) -> None:
+    export_monitor(Monitor("signal x\nsignal y\nrequire r: always (x < 9 and y < 9)", dt=1.0), tmp_path)
+    table = f"x,y\n1,1\n\n{cell},1\n"
+    done = subprocess.run([built(tmp_path)], input=table, capture_output=True, text=True, check=False)
+    assert done.returncode == code
+    assert done.stderr == ("" if code == 0 else f"x is not a number: {cell}\n")
+    assert ("satisfied" in done.stdout) == (cell == " 2 ")
+
+
 def test_a_specification_is_exported_without_a_run(tmp_path: Path) -> None:
     spec = tmp_path / "demo.stl"
     spec.write_text(SPEC)
