@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -190,7 +191,7 @@ class _Body:
         for i in self.kept:
             parts, word = self.parts.pop(i), self.kinds.get(i)
             if word is None:
-                word = any((part != "").any() for part in parts)
+                word = any(is_missing(cell) for part in parts for cell in np.unique(part) if cell)
             if not word:
                 parts = [p if p.dtype.kind == "f" else np.full(len(p), np.nan) for p in parts]
             columns.append(np.concatenate(parts))
@@ -237,9 +238,10 @@ class _Body:
         """Append the cells of a block to the column `i`; `places` are the numbers of their rows in it."""
         comma = self.mark != ","
         if i not in self.kinds:
-            first = next((text for cell in cells if not is_missing(text := bare(cell))), None)
-            if first is not None:
-                self.kinds[i] = number_of(first, comma=comma) is None
+            known = (number_of(cell, comma=comma) for cell in cells if not is_missing(bare(cell)))
+            first = next((value for value in known if value is None or value == value), math.nan)
+            if first is None or first == first:
+                self.kinds[i] = first is None
         if self.kinds.get(i) is False:
             values, bad = numbers(cells, comma=comma)
             if bad:

@@ -130,6 +130,15 @@ def test_infinity_is_a_value(tmp_path: Path, cell: str) -> None:
     assert read(path).groups[0].arrays["v"].tolist() == [1, np.inf, -np.inf]
 
 
+@pytest.mark.parametrize("unknown", ["nan", "NaN", "-nan(ind)", ""])
+def test_an_unknown_first_cell_does_not_tell_words_from_numbers(tmp_path: Path, unknown: str) -> None:
+    path = table(tmp_path / "a.csv", f"t,mode,x,none\n0,{unknown},{unknown},nan\n1,go,2,nan\n")
+    arrays = read(path, Wanted(("t", "mode", "x", "none"))).groups[0].arrays
+    assert arrays["mode"].tolist() == [unknown, "go"]
+    np.testing.assert_array_equal(arrays["x"], [np.nan, 2.0])
+    np.testing.assert_array_equal(arrays["none"], [np.nan, np.nan])
+
+
 def test_words_dates_and_times_are_texts(tmp_path: Path) -> None:
     text = "Date,Time,mode,code\n2026-01-01,10:30:25.0,NA,None\n2026-01-01,10:30:25.1,go,null\n"
     assert arrays_of([read(table(tmp_path / "a.csv", text))]) == {
