@@ -72,9 +72,11 @@ class MonitorNode(Node):
             self.diagnostics.publish(DiagnosticArray(status=told))
 
     def told(self, decision: Decision) -> DiagnosticStatus:
-        """A verdict as a diagnostic; a violation with its cause."""
+        """A verdict as a diagnostic; a violation with its cause, if no worse one was told before."""
         violated = decision.status == "violated"
         cause = self.online.cause(decision.requirement) if violated else None
+        if cause is not None and decision.start != cause.start and decision.sample != cause.sample:
+            cause = None
         low, high = self.online.bounds(decision.requirement, decision.start)
         values = {"start": f"{decision.time:g} s", "low": f"{low:g}", "high": f"{high:g}"}
         return DiagnosticStatus(

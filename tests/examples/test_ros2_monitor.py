@@ -46,6 +46,22 @@ def test_verdicts_come_on_diagnostics(example: ModuleType) -> None:
     assert found["stlc: moves"].values[0].value == "0 s"
 
 
+def test_a_violation_is_not_told_with_the_cause_of_a_worse_one(example: ModuleType) -> None:
+    node = example.MonitorNode(
+        Monitor("signal x\nrequire r: always[0, T] x > 0", horizon=2.0), 1.0, {"x": "/x:data"}, {}
+    )
+    told = []
+    node.create_subscription(
+        example.DiagnosticArray, "/diagnostics", lambda each: told.extend(each.status), 10
+    )
+    for value in (1, -5, 1, 1, -1, 1):
+        node.latest["x"] = float(value)
+        node.on_timer()
+    messages = {status.values[0].value: status.message for status in told}
+    assert messages["0 s"] == messages["1 s"] == "`x > 0` is false where x = -5, at t = 1 s"
+    assert messages["2 s"] == messages["4 s"] == "violated"
+
+
 def test_every_signal_needs_a_topic(example: ModuleType) -> None:
     with pytest.raises(SystemExit, match="no topic for the signals v"):
         example.MonitorNode(Monitor("signal v\nrequire r: v > 0"), 0.1, {}, {})
