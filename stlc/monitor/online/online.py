@@ -281,8 +281,8 @@ class Online:
     def bounds(self, name: str, start: int) -> tuple[float, float]:
         """Least and greatest robustness of the requirement `name` at a start, over all continuations.
 
-        The value at the start is not final yet, or it is the latest that became final. The bounds are
-        computed by this call.
+        The value at the start is not final yet, or the latest sample decided its verdict, or it is the
+        latest that became final. The bounds are computed by this call.
 
         Raises UsageError (U101) for another start.
         """
@@ -290,7 +290,8 @@ class Online:
         tally = watched.tally
         if tally.instants and start == tally.next - 1:
             return tally.last
-        if start not in watched.asked.starts(tally.next, self.samples):
+        told = isinstance(watched, Recomputed) and start in watched.news
+        if not told and start not in watched.asked.starts(tally.next, self.samples):
             raise usage(f"`{name}` is not open at sample {start}")
         judged = watched.judged(range(start, start + 1))
         return float(judged.low[0]), float(judged.high[0])

@@ -18,7 +18,7 @@ from stlc.compile.ir.simplify import simplify
 from stlc.compile.pipeline import Compiled
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.instants import rule_bounds
-from stlc.monitor.online import kernel
+from stlc.monitor.online import kernel, recompute
 from stlc.monitor.online.kernel import Streamed
 from stlc.monitor.online.online import How, Online
 from stlc.monitor.online.recompute import Recomputed
@@ -131,6 +131,20 @@ def test_without_a_compiler_a_stream_is_evaluated_anew(written, trace, end) -> N
         patch.setattr(kernel, "_library", lambda _: None)
         online = check_stream(formula, trace, How(at, end))
     assert isinstance(online._find(online.requirements[0]), Recomputed)
+
+
+def test_what_is_decided_has_bounds_where_many_starts_are_taken_together(monkeypatch) -> None:
+    monkeypatch.setattr(kernel, "_library", lambda _: None)
+    monkeypatch.setattr(recompute, "_NARROW", 8)
+    monitor, x = Monitor("signal x\nrequire r: eventually[0 s, 40 s] x > 0", dt=1.0), np.full(150, -1.0)
+    x[67], online, several = 1.0, monitor.online(How("all")), False
+    for k in range(len(x)):
+        online.push([x[k]])
+        told = [each.start for each in online.verdicts()]
+        least, most = monitor.bounds({"x": x[: k + 1]})
+        assert [online.bounds("r", start) for start in told] == [(least[i], most[i]) for i in told]
+        several |= len(told) > 1
+    assert several
 
 
 @pytest.mark.parametrize("every", [False, True])
