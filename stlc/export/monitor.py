@@ -6,6 +6,8 @@ variables, and needs libm alone.
 
 from __future__ import annotations
 
+import ctypes
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -170,5 +172,11 @@ def _table(name: str, rows: Sequence[Sequence[Any]]) -> str:
 def _single(text: str) -> str:
     """C text with the functions and literals of `float`."""
     text = re.sub(rf"\b({_LIBM})\(", r"\1f(", text.replace("const double", "const float"))
-    text = re.sub(r"(0x[0-9a-f.]+p[+-]?\d+)\)", r"\1f)", text)
+    text = re.sub(r"(0x[0-9a-f.]+p[+-]?\d+)\)", lambda found: f"{_nearest(found[1])})", text)
     return re.sub(r"\b(\d+\.\d+)\b(?!f)", r"\1f", text)
+
+
+def _nearest(number: str) -> str:
+    """C text of the `float` that is nearest to a number, as compilers warn of numbers beyond its range."""
+    value = ctypes.c_float(float.fromhex(number)).value
+    return "INF" if math.isinf(value) else f"{value.hex()}f"

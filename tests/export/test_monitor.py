@@ -166,6 +166,12 @@ def test_a_specification_is_exported_without_a_run(tmp_path: Path) -> None:
     assert main(["export", str(spec), "--to", "c", "--dt", "1s", "--at", "soon"]) == 2
 
 
+def test_numbers_beyond_the_range_of_float(tmp_path: Path) -> None:
+    monitor = Monitor("signal x\nrequire r: always x < 1e300\nrequire s: always x * 1e-60 < 1", dt=1.0)
+    export_monitor(monitor, tmp_path, single=True)
+    assert said(built(tmp_path, "-std=c99"), np.array([[1e30], [2.5]]), ("x",)) == [(np.inf, np.inf), (1, 1)]
+
+
 def test_what_has_no_transducers_is_refused(tmp_path: Path) -> None:
     monitor = Monitor("signal x\nrequire r: always (freeze a = x in eventually[0, 2 s] x > a)", dt=1.0)
     with pytest.raises(UsageError, match=r"U101.*`r` has no form as C"):
