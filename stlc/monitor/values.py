@@ -155,7 +155,7 @@ def bounds(
     if least is most:
         (value,) = record.values([formula], starts, end)
         return value, value
-    low, high = record.values([least, most], starts, end)
+    low, high = record.values([least, most], starts, "truncate")  # of cells, a part of a window may be empty
     return low, high
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from stlc.compile.semantics.tolerance import End
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
 from stlc.trace import Reading, Trace, trace_of
@@ -42,21 +43,22 @@ def recording(x: np.ndarray, y: np.ndarray, times: np.ndarray) -> Recording:
 
 
 @pytest.mark.parametrize("seed", range(150))
-def test_bounds_contain_the_value_on_all_samples(seed: int) -> None:
+def test_bounds_contain_those_on_all_samples(seed: int) -> None:
     rng = np.random.default_rng(seed)
     count = RATIO * int(rng.integers(3, 9)) + 1
     x, y = (np.round(rng.normal(size=count), 1) for _ in range(2))
     text = f"signal x, y\nrequire r: {formula(rng, int(rng.integers(1, 4)))}"
     dense = STEP / RATIO
     whole = Trace(Signature((Column("x"), Column("y"))), dense, {"x": x[None], "y": y[None]})
-    wanted = Monitor(text).check(whole, end="truncate")["r"]
+    end: End = "open" if seed % 2 else "truncate"
+    wanted = Monitor(text).check(whole, end=end)["r"]
     reading = Reading(resample=STEP, read={"x": False, "y": False}, words={"x": {}, "y": {}})
     coarse = trace_of(recording(x, y, dense * np.arange(count)), reading)
     assert coarse.samples == (count - 1) // RATIO + 1
-    found = Monitor(text).check(coarse, end="truncate")["r"]
-    low, high = found.bounds
-    assert low <= wanted.robustness + 1e-9, text
-    assert high >= wanted.robustness - 1e-9, text
+    found = Monitor(text).check(coarse, end=end)["r"]
+    (low, high), (least, most) = found.bounds, wanted.bounds
+    assert low <= least + 1e-9, text
+    assert high >= most - 1e-9, text
     if found.status != "inconclusive":
         assert found.status == wanted.status, text
 
@@ -73,6 +75,25 @@ def test_a_grid_of_the_recorded_step_changes_nothing(seed: int) -> None:
     wanted, found = (Monitor(text).check(each)["r"] for each in (whole, again))
     assert found.bounds == wanted.bounds
     assert found.status == wanted.status
+
+
+@pytest.mark.parametrize(("written", "status"), [("x > 0", "satisfied"), ("x > 1.5", "violated")])
+def test_a_window_to_the_end_ends_within_the_last_step(written: str, status: str) -> None:
+    x, times = np.array([1.0, -1, 0.5, -1, 1, 0.5]), np.array([0, 0.3, 0.5, 1.2, 2.0, 2.3])
+    reading = Reading(resample=1.0, read={"x": False, "y": False}, words={"x": {}, "y": {}})
+    trace = trace_of(recording(x, x, times), reading)
+    monitor = Monitor(f"signal x, y\nrequire r: always eventually {written}")
+    assert monitor.check(trace)["r"].status == status
+
+
+@pytest.mark.parametrize("end", ["open", "truncate"])
+def test_the_start_of_a_window_is_an_instant_of_the_grid(end: End) -> None:
+    x, times = np.array([1.0, 1, 1, -2, 1, 1]), np.array([0, 1, 2, 2.75, 3, 4])
+    reading = Reading(resample=1.0, read={"x": False, "y": False}, words={"x": {}, "y": {}})
+    trace = trace_of(recording(x, x, times), reading)
+    cause = Monitor("signal x, y\nrequire r: always[0, 1] x > 0").check(trace, at=2, end=end)["r"].cause
+    assert cause is not None
+    assert (cause.time, cause.started_at, cause.started) == (2.75, 2.0, "t = 2 s")
 
 
 def spiked(count: int = 1000) -> Recording:

@@ -129,12 +129,16 @@ class Cause:
     @property
     def started(self) -> str:
         """Instant at which the requirement was evaluated, as text."""
-        return self.timeline.moment(self.start - self.first)
+        return self._grid.moment(self.start - self.first)
 
     @property
     def started_at(self) -> float:
         """The same in seconds."""
-        return self.timeline.time(self.start - self.first)
+        return self._grid.time(self.start - self.first)
+
+    @property
+    def _grid(self) -> Timeline:
+        return replace(self.timeline, times=None)
 
     @property
     def shown(self) -> int:
