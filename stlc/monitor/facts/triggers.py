@@ -78,14 +78,14 @@ class _Walk:
         match node.op:
             case "always" | "historically":
                 yield from self.visit(last, self.window(node, at))
-            case "eventually" if (held := self.held(last)) is not None:
+            case "eventually" if (held := self.held(last, surely=True)) is not None:
                 lo = self.steps(node).lo
                 if not node.on_clock and lo < len(held):
                     there = np.zeros_like(held)
                     there[: len(held) - lo] = held[lo:]
                     yield Trigger(node.span, at, at & ~there, "at once")
             case "until" | "unless" | "release":
-                ends = self.held(first if node.op == "release" else last)
+                ends = self.held(first if node.op == "release" else last, surely=True)
                 if not node.on_clock and not self.steps(node).lo and ends is not None:
                     yield Trigger(node.span, at, at & ~ends)
             case _:
@@ -120,12 +120,17 @@ class _Walk:
         instants[self.part.stop :] = False
         return instants
 
-    def held(self, node: typed.Formula) -> Bools | None:
-        """Instants at which a formula may hold, (samples, traces); None if it reads a frozen value."""
+    def held(self, node: typed.Formula, *, surely: bool = False) -> Bools | None:
+        """Instants at which a formula may hold, or surely does, (samples, traces).
+
+        None if it reads a frozen value, or a signal that makes no difference to the requirement.
+        """
         if node.frozen:
             return None
         written = node.from_first_sample() if node.absolute else node
         formula = by_truth(simplify(self.subject.compiled.grid.lower(written, [])))
+        if not formula.columns <= self.subject.record.env.keys():
+            return None
         record = self.subject.record.of_cells(formula, loose=False)
-        _, high = outer(*bounds(formula, record, range(record.samples), "truncate"))
-        return np.asarray(high > 0)
+        low, high = outer(*bounds(formula, record, range(record.samples), "truncate"))
+        return np.asarray((low if surely else high) > 0)

@@ -95,6 +95,20 @@ def test_true_at_once(text: str, facts: list[str]) -> None:
     assert told(check(text, X, Y), "W713") == facts
 
 
+@pytest.mark.parametrize("text", ["eventually[0 s, 3 s] x > 0", "y > 0 until[0 s, 3 s] x > 0"])
+def test_an_unknown_sample_is_not_true_at_once(text: str) -> None:
+    verdict = check(text, np.array([np.nan, 1.0, 1.0, 1.0]), Y)
+    assert verdict.satisfied
+    assert not verdict.facts_on("r")
+
+
+@pytest.mark.parametrize("text", ["always (y > 0 -> (x > 0 or true))", "always (y > 0 -> (y > 1 -> true))"])
+def test_a_signal_that_makes_no_difference_triggers_nothing(text: str) -> None:
+    verdict = check(text, X, Y)
+    assert verdict.satisfied
+    assert not told(verdict, "W712")
+
+
 def test_traces_are_counted_for_themselves() -> None:
     x = np.stack([X, X - 9.0, X - 9.0])
     assert told(check("always (x > 1 -> y > 0)", x, np.ones_like(x)), "W712") == [
