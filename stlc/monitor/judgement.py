@@ -704,8 +704,8 @@ class Verdict:
 
 
 def worst_of(found: Iterable[RequirementVerdict]) -> RequirementVerdict:
-    """Return the verdict with the least weighted lower bound on its robustness."""
-    return min(found, key=lambda each: float(each.low.min()) * each.rule.factor)
+    """Return the verdict with the least weighted lower bound on its robustness by traces in scope."""
+    return min(found, key=lambda each: float(each.counted(each.low).min(initial=np.inf)) * each.rule.factor)
 
 
 def overall_robustness(

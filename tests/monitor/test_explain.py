@@ -18,6 +18,7 @@ from stlc.compile.ir import typed
 from stlc.diagnostics import UsageError
 from stlc.monitor.explain.causes import CauseFinder, CauseNode
 from stlc.monitor.explain.report import explain, names_in, shown, violations
+from stlc.monitor.explain.tree import explanation
 from stlc.monitor.online.online import How
 from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
@@ -294,6 +295,15 @@ def test_a_planning_window_that_the_end_cuts_is_explained_in_the_recording() -> 
     cause = explain(monitor.check({"x": np.array([1.0, -2.0])}, end="truncate"), "r")
     assert cause is not None
     assert (cause.sample, cause.predicate) == (1, "x > 0")
+
+
+def test_what_comes_closest_does_so_in_scope() -> None:
+    monitor = Monitor("signal x, y\nassume s: x > -9\nrequire a: x > 0\nrequire b: y > 0", dt=1)
+    columns = {"x": np.array([[5.0, 5], [-10, -10]]), "y": np.array([[1.0, 1], [2, 2]])}
+    found = explanation(monitor.check(columns))
+    assert found.closest == "nothing is violated (satisfied); b comes closest: 1 at trace 0"
+    outside = explanation(monitor.check({name: values[1:] for name, values in columns.items()}))
+    assert outside.closest.startswith("nothing is violated (out of scope)")
 
 
 def test_what_is_not_violated_has_no_cause() -> None:

@@ -87,7 +87,7 @@ class Explanation:
     def closest(self) -> str:
         """That nothing is violated, and the least robustness: whose it is and where."""
         worst = self.verdict.worst
-        return f"nothing is violated ({self.verdict.overall}); {worst.name} comes closest: {worst.brief}"
+        return f"nothing is violated ({self.verdict.scoped}); {worst.name} comes closest: {worst.brief}"
 
 
 def explanation(verdict: Verdict) -> Explanation:
