@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from stlc.compile.semantics.tolerance import TOLERANCE, End
-from stlc.diagnostics import usage
+from stlc.diagnostics import SpecError, usage
 from stlc.files import File
 from stlc.source import Source
 
@@ -322,10 +322,15 @@ def judge_lines(
     reading = reading_options(monitor, question)
     stream = SampleStream(name, reading)
     uniform = on_grid(stream.samples(pieces), reading, name)
-    step = uniform.dt or monitor.compiled.grid.dt or 0
-    at = instant_of(question.at, f"the {name}", float(step), uniform.t0, None)
-    how = How(at, question.end, question.tolerance, uniform.t0, reasons=True)
-    online = monitor.online(how, require=question.require, dt=uniform.dt)
+    try:
+        step = uniform.dt or monitor.compiled.grid.dt or 0
+        at = instant_of(question.at, f"the {name}", float(step), uniform.t0, None)
+        how = How(at, question.end, question.tolerance, uniform.t0, reasons=True)
+        online = monitor.online(how, require=question.require, dt=uniform.dt)
+    except SpecError as error:
+        if uniform.dt is None and {each.code for each in error.diagnostics} == {"E311"}:
+            raise uniform.without_step(name) from None
+        raise
     return watched(online, uniform, stream.units, name, tell)
 
 

@@ -183,24 +183,26 @@ class SampleStream:
             return self._object(text)
         if text and not self._heads:
             self._header(text)
-        elif filled(text, self._delimiter):
-            return self._row(line)
-        return None
+            if not self.reading.columns:
+                return None
+        return self._row(line) if filled(text, self._delimiter) else None
 
-    def _bad(self, what: str, code: str = "E603") -> TraceError:
-        return TraceError.of(code, f"line {self._number} of the {self.name} {what}")
+    def _bad(self, what: str, code: str = "E603", *help_: str) -> TraceError:
+        return TraceError.of(code, f"line {self._number} of the {self.name} {what}", help=help_)
 
     # ------------------------------------------------------------------------ names
 
     def _header(self, text: str) -> None:
         self._delimiter = delimiter_of(text)
-        cells = head_cells(text.removeprefix("#").strip(), self._delimiter)
+        given = self.reading.columns
+        cells = given or head_cells(text.removeprefix("#").strip(), self._delimiter)
         names, units = zip(*map(split_head, cells), strict=True)
         read = [name for name in names if self.reading.wanted.reads(name)]
         if len(set(read)) < len(read) or not all(read):
             raise self._bad("does not name every column, or names one twice", "E605")
-        if all(value_of(name) is not None for name in names):
-            raise self._bad("has numbers where the columns are named", "E605")
+        if not given and all(value_of(name) is not None for name in names):
+            help_ = "--columns t,x,v  names the columns of a stream without a header"
+            raise self._bad("has numbers where the columns are named", "E605", help_)
         self._heads = names
         self.units = dict(zip(names, units, strict=True))
         self._named(name for name in names if name and name != self._group(names))
@@ -211,6 +213,8 @@ class SampleStream:
         names = {signal: old for signal, old in self.reading.names.items() if signal != CLOCK}
         units = {name: self.units.get(name, "") for name in known}
         self._clock = StreamClock.of(self.name, units, self.reading.setting, read)
+        if self._clock is not None and known.count(self._clock.name) > 1:
+            raise self._bad("names its clock twice", "E605")
         missing = [old for old in names.values() if old not in known and (read is None or old in read)]
         if missing:
             raise TraceError(*(absent(self.name, old, known) for old in missing))
@@ -242,7 +246,7 @@ class SampleStream:
             except csv.Error as error:
                 raise self._bad(f"is no row of cells: {error}") from None
         if len(cells) != len(self._heads):
-            what = f"has {len(cells)} cells, the header names {len(self._heads)} columns"
+            what = f"has {len(cells)} cells, and {len(self._heads)} columns are named"
             raise self._bad(what, "E605")
         values = [number_of(cell, comma=mark != ",") for cell in cells]
         texts = [
@@ -329,6 +333,10 @@ class Uniform:
     dt: float | None
     samples: Iterator[Samples]
     aside: Callable[[], int] = lambda: 0
+
+    def without_step(self, name: str) -> TraceError:
+        """Error E601 of a stream without a clock, whose time step is needed."""
+        return TraceError.of("E601", f"the {name} has no `t`", help=(NO_CLOCK, NO_STEP))
 
 
 def on_grid(samples: Iterator[Samples], reading: Reading, name: str) -> Uniform:

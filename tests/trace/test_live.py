@@ -85,6 +85,16 @@ def test_a_time_that_is_infinite_in_seconds() -> None:
     assert code_of("t [h],x\n0,1\n1e308,1\n", Reading()) == "E603"
 
 
+def test_a_stream_without_a_header_is_read_by_the_names_that_are_given() -> None:
+    reading = Reading(columns=("t", "x [m]"))
+    assert samples_of("0,1\n1,2\n2,3\n", reading) == [{"x": 1.0}, {"x": 2.0}, {"x": 3.0}]
+    assert code_of("0,1,2\n", reading) == "E605"
+
+
+def test_a_clock_is_named_once() -> None:
+    assert code_of("t,t,x\n0,0,1\n1,1,2\n", Reading()) == "E605"
+
+
 def test_lines_of_empty_cells_are_skipped() -> None:
     found = samples_of("t,x\n0,1\n,\n , \n1,2\n", Reading())
     assert found == [{"x": 1.0}, {"x": 2.0}]
