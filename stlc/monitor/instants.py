@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Literal, TypeAlias
+from operator import index
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.support import Reach
 from stlc.compile.namespace import Array
 from stlc.compile.pipeline import CompiledRequirement
+from stlc.compile.semantics.tolerance import End
 from stlc.diagnostics import Diagnostic, usage
 from stlc.monitor.prefix_bounds import FAR, lengthened, prefix_bound, with_seen
 from stlc.monitor.uncertain import outer
@@ -29,6 +31,22 @@ from stlc.monitor.values import Ends, Record, bounds, window_bounds
 
 At: TypeAlias = int | Literal["all"] | None
 """A sample; every sample with a complete window; or the instants that the requirement prescribes."""
+
+
+def asked_at(at: Any, end: str, tolerance: float) -> At:
+    """Return the instants of a question whose parts mean something. Raises UsageError (U101) for others."""
+    if end not in get_args(End):
+        raise usage(f"`end` is one of {', '.join(get_args(End))}, not {end!r}")
+    if not 0 <= tolerance < math.inf:
+        raise usage(f"the tolerance is a number from 0 on, not {tolerance}")
+    if at is None:
+        return None
+    if isinstance(at, str) and at == "all":
+        return "all"
+    try:
+        return index(at)
+    except TypeError:
+        raise usage(f'`at` is the number of a sample, "all" or None, not {at!r}') from None
 
 
 def starts_of(rule: CompiledRequirement, samples: int, horizon: int | None, at: At) -> range:

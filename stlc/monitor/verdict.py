@@ -32,6 +32,7 @@ from stlc.monitor.given import plain as plain_signals
 from stlc.monitor.grid import Times, agreed_times, given_times, named_times, require_windows, system_of
 from stlc.monitor.instants import (
     At,
+    asked_at,
     check_length,
     live_bounds,
     rule_at,
@@ -164,6 +165,7 @@ class Monitor:
             UsageError: U101, an unknown requirement or semantics, a sample number beyond the trace, or an
                 uncertainty that does not fit (`stlc.monitor.uncertain`).
         """
+        at = asked_at(at, end, tolerance)
         reported = semantics_of(semantics)
         if uncertain and not reported.exact:
             raise usage("uncertain signals have bounds in exact semantics only")
@@ -211,6 +213,7 @@ class Monitor:
         Returns:
             An array of the shape of the signals; with `at`, of that shape without the time axis.
         """
+        _require_end(end)
         chosen, known = semantics_of(semantics, smoothing), self._selected.get(_ALL)
         if known is not None and type(signals) is dict and chosen.exact:
             found = known.least(signals, end, at)
@@ -227,6 +230,7 @@ class Monitor:
         semantics: str | Semantics = "exact",
     ) -> dict[str, Array]:
         """Robustness of each requirement by name, without weight and scale; arguments as of `robustness`."""
+        _require_end(end)
         ready = self._prepare(signals, at=at, semantics=semantics_of(semantics))
         return robustness_signals(ready, end, at)
 
@@ -400,6 +404,11 @@ def _plan(selected: _Selection, samples: int, end: Boundary, at: int | None) -> 
         return None
     instants = range(samples) if at is None else range(at, at + 1)
     return signal_plan(tuple(rule.formula for rule in rules), samples, instants, end)
+
+
+def _require_end(end: str) -> None:
+    if end not in ("strict", "truncate"):
+        raise usage(f"the `end` of a value is strict or truncate, not {end!r}")
 
 
 def _chosen(compiled: Compiled, names: Sequence[str]) -> tuple[CompiledRequirement, ...]:

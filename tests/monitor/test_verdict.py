@@ -258,6 +258,33 @@ def test_a_short_trace_satisfies_violates_or_does_not_say() -> None:
     assert (known.satisfied, known.robustness, known.bounds) == (True, 2.0, (2.0, np.inf))
 
 
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [
+        ({"at": 1.5}, "`at` is the number"),
+        ({"at": "each"}, "`at` is the number"),
+        ({"end": "cut"}, "`end` is one of open, strict, truncate, not 'cut'"),
+        ({"tolerance": -1.0}, "the tolerance is a number from 0 on"),
+        ({"tolerance": np.nan}, "the tolerance is a number from 0 on"),
+    ],
+)
+def test_what_means_nothing_is_no_question(asked: dict, told: str) -> None:
+    monitor = Monitor("signal a\nrequire r: always[0, 2] a > 0", dt=1)
+    for ask in (lambda: monitor.check({"a": np.ones(4)}, **asked), lambda: monitor.online(How(**asked))):
+        with pytest.raises(UsageError, match=told):
+            ask()
+    with pytest.raises(UsageError, match="strict or truncate"):
+        monitor.robustness({"a": np.ones(4)}, end="open")
+
+
+def test_an_index_of_numpy_is_a_sample() -> None:
+    monitor, signals = Monitor("signal a\nrequire r: a > 0", dt=1), {"a": np.array([1.0, -1.0])}
+    assert not monitor.check(signals, at=np.argmin(signals["a"])).satisfied
+    online = monitor.online(How(at=np.argmin(signals["a"])))
+    online.feed(signals)
+    assert online.finish()["r"].status == "violated"
+
+
 @pytest.mark.parametrize("samples", [1, 2, 9, 60])
 @pytest.mark.parametrize(
     "formula",

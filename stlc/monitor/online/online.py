@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any, Literal, TypeAlias
 
@@ -14,7 +14,7 @@ from stlc.compile.semantics.tolerance import TOLERANCE, Status, StatusInScope
 from stlc.diagnostics import TraceError, usage
 from stlc.jsontext import Count, Num
 from stlc.monitor.explain.report import Cause
-from stlc.monitor.instants import At, check_length, starts_of
+from stlc.monitor.instants import At, asked_at, check_length, starts_of
 from stlc.monitor.judgement import require_known
 from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.kernel import Streamed, StreamKernel, streamed_rule
@@ -111,7 +111,8 @@ class Online:
     def __init__(
         self, compiled: Compiled, rules: Sequence[CompiledRequirement], how: How | None = None
     ) -> None:
-        self.how = how or How()
+        how = how or How()
+        self.how = replace(how, at=asked_at(how.at, how.end, how.tolerance))
         self._ends: Ends = "truncate" if self.how.end == "truncate" else "open"
         self.compiled = compiled
         self._needs = needs_of(compiled, [*rules, *compiled.assumptions])
@@ -191,11 +192,15 @@ class Online:
             The number of starts that are decided, and the number of samples taken.
 
         Raises:
-            TraceError: E605, the array has another shape.
+            TraceError: E605, the array has another shape, or holds other things than numbers.
         """
-        rows = np.asarray(rows, dtype=np.float64)
-        if rows.shape[1:] != (len(self.signals),):
+        try:
+            given = np.asarray(rows)
+        except ValueError:  # rows of several lengths
+            raise self._no_row() from None
+        if given.dtype.kind not in "fiub" or given.shape[1:] != (len(self.signals),):
             raise self._no_row()
+        rows = given.astype(np.float64, copy=False)
         if pause and (self._recomputed or self._kernel is None):
             rows = rows[:1]
         decided, taken = 0, len(rows)

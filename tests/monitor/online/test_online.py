@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.diagnostics import StlcError, UsageError
+from stlc.diagnostics import StlcError, TraceError, UsageError
 from stlc.monitor.online.history import ColumnHistory
 from stlc.monitor.online.online import How
 from stlc.monitor.prefix_bounds import FAR, lengthened, prefix_bound, with_seen
@@ -351,3 +351,12 @@ def test_values_that_are_final_need_no_samples(formula: str, end, at: int | None
     assert len(next(iter(online._history.columns().values()))) < 100
     wanted, found = monitor.check(trace, at=at, end=end)["r"], online.finish()["r"]
     assert (found.low, found.high, found.status) == (*wanted.bounds, wanted.overall)
+
+
+@pytest.mark.parametrize("rows", [[["1", "2"]], [[None, 1.0]], [[1.0, 2.0], [3.0]], [[1.0]], 3.0, [{}]])
+@pytest.mark.parametrize("formula", ["x > y", "freeze z = x in y > z"])
+def test_a_block_that_is_no_numbers_is_refused(rows: object, formula: str) -> None:
+    online = Monitor(f"signal x, y\nrequire r: {formula}", dt=1).online()
+    with pytest.raises(TraceError, match="E605: a sample is one number for each of x, y"):
+        online.push_block(rows)  # type: ignore[arg-type]
+    assert online.samples == 0
