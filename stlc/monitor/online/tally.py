@@ -11,7 +11,6 @@ from typing import NamedTuple, final
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.ir.support import Reach
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.tolerance import TOLERANCE, StatusInScope
 from stlc.monitor.instants import live_bounds, rule_bounds, span_of
@@ -59,10 +58,8 @@ class Asked:
         """Starts from `first` on in a trace of `samples` samples."""
         return range(first, samples if self.everywhere else min(self.begin + 1, samples))
 
-    @cached_property
-    def span(self) -> Reach:
-        """Samples before and after a start that its value may depend on; see `span_of`."""
-        return span_of(self.rule, self.horizon)
+    span = cached_property(lambda self: span_of(self.rule, self.horizon))
+    """Samples before and after a start that its value may depend on; see `span_of`."""
 
     def settled(self, samples: int) -> int:
         """The first instant at which a sample after `samples` of them may change the value."""
