@@ -171,7 +171,13 @@ def inconclusive(row: RequirementVerdict, verdict: Verdict | None) -> str:
     name, part, dt = visible(row.name), row.part, verdict.about.dt or 0.0
     last = row.start - part.first + row.instants - 1 + row.rule.reach
     needed, length = last * dt, (part.stop - part.first - 1) * dt
-    gaps = [text for signal, text in _gap_texts(verdict).items() if signal in row.rule.formula.columns]
+    time, read = row.timeline.time, row.parts_read or (row.timeline.duration,)
+    gaps = [
+        text
+        for (signal, text), gap in zip(_gap_texts(verdict).items(), verdict.gaps.values(), strict=True)
+        if signal in row.rule.formula.columns
+        and any(time(gap.first) <= each.last and each.first <= time(gap.last) for each in read)
+    ]
     if gaps and needed <= length:
         return f"{name} is inconclusive: {', '.join(gaps)}."
     if needed > length:

@@ -14,7 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stlc.cli.commands.check.text import inconclusive
 from stlc.cli.framework.app import main
+from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
 from stlc.trace import Trace, TraceMeta
 
@@ -125,6 +127,14 @@ def test_inconclusive(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     assert "give_way is inconclusive: it needs 2.5 s of signal, the trace has 1.9 s." in out
     assert "[-0.500, +2.500]" in out
+
+
+def test_a_sample_that_is_not_read_leaves_nothing_open() -> None:
+    monitor = Monitor("signal x, y\nrequire r: x > 0 or y > 0", dt=1)
+    x, y = np.array([-1.0, np.nan]), np.array([np.nan, 1.0])
+    verdict = monitor.check({"x": x, "y": y}).told()
+    text = "r is inconclusive: `y` is unknown at 1 of 2 samples (t = 0 s)."
+    assert inconclusive(verdict["r"], verdict) == text
 
 
 def test_a_violation_outweighs_what_is_not_known() -> None:
