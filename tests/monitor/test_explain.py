@@ -237,6 +237,13 @@ def test_a_value_that_a_cut_window_needs_too_does_not_decide_alone() -> None:
     assert (cause.sample, cause.alone) == (3, True)
 
 
+def test_values_that_are_equal_are_told_as_they_are() -> None:
+    monitor = Monitor("signal x\nrequire r: not (x > 0 until[0, 2] x > 3)", dt=1)
+    cause = explain(monitor.check({"x": np.array([1.0, 4, 5])}), "r")
+    assert cause is not None
+    assert (cause.tree.rho, cause.tree.leaf.rho) == (-1.0, 1.0)
+
+
 def test_an_absolute_window_is_violated_where_it_is_required() -> None:
     monitor = Monitor("signal x\nrequire r: always[1, 3] eventually@[0, 0] x > 0", dt=1)
     cause = explain(monitor.check({"x": -np.ones(5)}), "r")

@@ -221,6 +221,7 @@ class CauseFinder:
         cache: (formula, truth value that it should have) -> the lowered formula, negated for False.
         known: lowered formula -> list of pairs (range of instants, upper bounds on the robustness at them).
         tied: predicate values, one of them slightly increased, on which formulas are then evaluated.
+        given: finder with the values as they are, which are told; None if this one has them.
         stop: number of samples that the complete trace would have, if the recording is shorter; else None.
         exact: whether truth values decide, so that `x > 0` is false at 0: the tolerance is 0.
         frozen: values of the enclosing `freeze` operators.
@@ -232,6 +233,7 @@ class CauseFinder:
     cache: dict[tuple[typed.Formula, bool], ir.Formula] = field(default_factory=dict)
     known: dict[ir.Formula, list[tuple[range, Floats]]] = field(default_factory=dict)
     tied: _Tied | None = None
+    given: CauseFinder | None = None
     stop: int | None = None
     exact: bool = False
     frozen: Mapping[str, FrozenValue] = field(default_factory=dict)
@@ -263,7 +265,9 @@ class CauseFinder:
             raised = replace(tied, raised=chosen)
             if raised.worth(lowered, sample) > worth:
                 if chosen not in first:
-                    tree = replace(self, cache={}, known={}, tied=raised).blame(formula, sample, wanted)
+                    tree = replace(self, cache={}, known={}, tied=raised, given=self).blame(
+                        formula, sample, wanted
+                    )
                 return tree, self._alone(tree, lowered)
         return tree, False
 
@@ -311,7 +315,7 @@ class CauseFinder:
 
     def blame(self, formula: typed.Formula, sample: int, wanted: bool = True) -> CauseNode:
         """Return the tree that explains why `formula` does not have the truth value `wanted` at `sample`."""
-        margin = self._margin(formula, sample, wanted)
+        margin = (self.given or self)._margin(formula, sample, wanted)
         margin = 0.0 if margin == _FALSE else margin
         node = CauseNode(formula, not wanted, sample, margin if wanted else -margin)
         match formula:
@@ -449,7 +453,7 @@ class CauseFinder:
 
     def _freeze(self, node: CauseNode, formula: typed.Freeze) -> CauseNode:
         values = {**self.frozen, **self._values(formula, node.sample)}
-        inner = replace(self, cache={}, known={}, tied=None, frozen=values)
+        inner = replace(self, cache={}, known={}, tied=None, given=None, frozen=values)
         tree, alone = inner.why(formula.body, node.sample, wanted=not node.holds)
         stored = self._reads((num for _, num in formula.bindings), node.sample)
         frozen = {(name, node.sample + later) for name, later in stored}
