@@ -237,6 +237,22 @@ def test_a_value_that_a_cut_window_needs_too_does_not_decide_alone() -> None:
     assert (cause.sample, cause.alone) == (3, True)
 
 
+@pytest.mark.parametrize(
+    ("written", "because"),
+    [
+        ("always[0, 1] (once x > 2 unless[2, inf] y > 0)", "`x > 2` is false where x = 1, at t = 0 s"),
+        ("prev(always[1, 1] y > 0)", "`prev(always[1, 1] y > 0)` is false whatever the signals are"),
+        ("x > 2 and eventually[4, 5] y > 0", "`x > 2` is false where x = 1, at t = 0 s"),
+    ],
+)
+def test_the_robustness_of_a_window_beyond_the_end_is_that_of_the_verdict(written: str, because: str) -> None:
+    monitor = Monitor(f"signal x, y\nrequire r: {written}", dt=1)
+    verdict = monitor.check({"x": np.array([1.0]), "y": np.array([-1.0])}, end="truncate")
+    cause = explain(verdict, "r")
+    assert cause is not None
+    assert (cause.because, cause.tree.rho) == (because, verdict["r"].robustness)
+
+
 def test_values_that_are_equal_are_told_as_they_are() -> None:
     monitor = Monitor("signal x\nrequire r: not (x > 0 until[0, 2] x > 3)", dt=1)
     cause = explain(monitor.check({"x": np.array([1.0, 4, 5])}), "r")

@@ -265,10 +265,15 @@ class _JudgedTrace:
         return TOLERANCE.violated(float(high.max()), tolerance)
 
     def cut(self, starts: range) -> NDArray[np.bool_]:
-        """Starts from which the end cuts windows, (count,); those of others lie beyond it."""
+        """Starts whose violation is explained with windows that the end cuts, (count,).
+
+        Windows of the others begin beyond the end, and nothing that follows could undo their violation.
+        """
         if self.judgement.ends == "open":
             return np.zeros(len(starts), dtype=np.bool_)
-        return ~beyond(self.judgement.rule, starts, self.subject.record.samples, self.subject.horizon)
+        rule, record, horizon = self.judgement.rule, self.subject.record, self.subject.horizon
+        high = np.asarray(rule_bounds(rule, record, starts, horizon, "open")[1].max(axis=1))
+        return ~(beyond(rule, starts, record.samples, horizon) & (high < 0.0))
 
     def finder(self, start: int, *, cut: bool) -> CauseFinder:
         record = self.subject.record
