@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from collections.abc import Mapping
 from functools import partial, reduce
 
@@ -96,6 +97,9 @@ def main() -> None:
     parser.add_argument("--type", action="append", default=[], metavar="TOPIC=PACKAGE/msg/TYPE")
     parser.add_argument("--seconds", type=float, default=1.0, help="simulated time without ROS")
     asked = parser.parse_args()
+    for each in asked.signal:
+        if not re.fullmatch(r"[^=]+=[^:]+:.+", each):
+            parser.error(f"--signal {each} is not NAME=TOPIC:FIELD")
     topics = dict(each.split("=", 1) for each in asked.signal)
     if not ROS:
         MonitorNode(Monitor(asked.spec), asked.dt, topics, {})

@@ -65,3 +65,13 @@ def test_a_violation_is_not_told_with_the_cause_of_a_worse_one(example: ModuleTy
 def test_every_signal_needs_a_topic(example: ModuleType) -> None:
     with pytest.raises(SystemExit, match="no topic for the signals v"):
         example.MonitorNode(Monitor("signal v\nrequire r: v > 0"), 0.1, {}, {})
+
+
+@pytest.mark.parametrize("signal", ["v", "v=/odom", "v=/odom:", "=/odom:x"])
+def test_a_signal_is_named_with_its_topic_and_field(
+    example: ModuleType, signal: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["ros2_monitor.py", "v.stl", "--dt", "1", "--signal", signal])
+    with pytest.raises(SystemExit):
+        example.main()
+    assert f"--signal {signal} is not NAME=TOPIC:FIELD" in capsys.readouterr().err
