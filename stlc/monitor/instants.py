@@ -37,8 +37,8 @@ def asked_at(at: Any, end: str, tolerance: float) -> At:
     """Return the instants of a question whose parts mean something. Raises UsageError (U101) for others."""
     if end not in get_args(End):
         raise usage(f"`end` is one of {', '.join(get_args(End))}, not {end!r}")
-    if not 0 <= tolerance < math.inf:
-        raise usage(f"the tolerance is a number from 0 on, not {tolerance}")
+    if not math.isfinite(tolerance):
+        raise usage(f"the tolerance is a finite number, not {tolerance}")
     if at is None:
         return None
     if isinstance(at, str) and at == "all":

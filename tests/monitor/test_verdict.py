@@ -264,8 +264,8 @@ def test_a_short_trace_satisfies_violates_or_does_not_say() -> None:
         ({"at": 1.5}, "`at` is the number"),
         ({"at": "each"}, "`at` is the number"),
         ({"end": "cut"}, "`end` is one of open, strict, truncate, not 'cut'"),
-        ({"tolerance": -1.0}, "the tolerance is a number from 0 on"),
-        ({"tolerance": np.nan}, "the tolerance is a number from 0 on"),
+        ({"tolerance": np.inf}, "the tolerance is a finite number"),
+        ({"tolerance": np.nan}, "the tolerance is a finite number"),
     ],
 )
 def test_what_means_nothing_is_no_question(asked: dict, told: str) -> None:

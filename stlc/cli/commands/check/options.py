@@ -141,6 +141,8 @@ class Judging(Traces):
 
     def question(self, **more: Any) -> Question:
         """Return the options as a `Question`. Raises UsageError (U101) if one is malformed."""
+        if not 0 <= self.tolerance < math.inf:
+            raise usage(f"`--tolerance {self.tolerance}` is not a number from 0 on")
         errors = uncertainties(parse_pairs(self.uncertain, "--uncertain", "SIGNAL=ERROR", "x=0.1m"))
         given = {name: getattr(self, name) for name in ("at", "end", "tolerance", "semantics", "strict")}
         return Traces.question(self, **{**given, "uncertain": errors, **more})
