@@ -48,6 +48,7 @@ sys.exit(stopping.finish(4))
 """
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_command_that_is_done_keeps_its_exit_code(number: int) -> None:
     with subprocess.Popen([sys.executable, "-c", UNLOADING], stdout=subprocess.PIPE) as process:

@@ -76,6 +76,7 @@ def test_one_that_will_not_be_asked_is_ended_too(tmp_path):
     assert left(tmp_path) == []
 
 
+@pytest.mark.apart
 @pytest.mark.skipif(sys.platform != "linux", reason="needs to know the processor time")
 def test_one_that_works_is_waited_for_and_not_for_ever(monkeypatch):
     monkeypatch.setattr(toolchain, "IDLE", 5.0)  # a machine that is busy does nothing for a while
@@ -86,6 +87,7 @@ def test_one_that_works_is_waited_for_and_not_for_ever(monkeypatch):
     assert ended.value.worked
 
 
+@pytest.mark.apart
 def test_one_that_makes_slow_progress_is_not_waited_for_for_ever(monkeypatch):
     monkeypatch.setattr(toolchain, "IDLE", 5.0)
     monkeypatch.setattr(toolchain, "ELAPSED", 1.0)

@@ -45,6 +45,7 @@ def test_a_missing_program_is_named_with_its_package(monkeypatch, capsys):
     assert "apt install gcc-arm-none-eabi" in capsys.readouterr().err
 
 
+@pytest.mark.apart
 @pytest.mark.skipif(
     not all(map(shutil.which, ("arm-none-eabi-gcc", "qemu-system-arm"))), reason="apt install qemu-system-arm"
 )

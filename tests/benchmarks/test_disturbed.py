@@ -79,6 +79,7 @@ def at(result: dict[str, Any]) -> tuple[str, str]:
     return result["key"]["scenario"], result["key"]["guard"]
 
 
+@pytest.mark.apart
 def test_what_was_driven_is_kept(
     run: RunDir, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

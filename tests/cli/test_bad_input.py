@@ -89,6 +89,7 @@ def test_states_that_explode(push: str, what: str, method: str, capsys: pytest.C
     assert "note: with u = " in said
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize(
     ("changed", "rules"), [({}, LOW + NEAR), ({"terms": TERM}, NEAR)], ids=["requirement", "term"]
 )
@@ -122,6 +123,7 @@ def test_weights_that_are_no_numbers_are_not_kept(capsys: pytest.CaptureFixture[
     assert not (RunDir.newest().path / "ckpt").exists()
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize(
     ("rules", "message", "places"),
     [

@@ -184,6 +184,7 @@ def check_losses(formulas: list[typed.Formula], seed: int, *, native: bool) -> N
             assert torch.isfinite(slope).all()
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("native", [True, False])
 def test_a_missed_deadline_drops_out_of_the_loss_and_leaves_the_other_requirements(native: bool) -> None:
     path = Path("plane.yaml")

@@ -91,6 +91,7 @@ def test_time_tests_stay_and_negated_predicates_are_tightened_too() -> None:
     assert float(with_margins(task, {"clear": 0.5}).judge(x0, still).requirements[0, 0]) == pytest.approx(0.5)
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("mode", ["paper", "full"])
 def test_a_guard_keeps_away_and_tells_the_plain_verdict(mode: str) -> None:
     task, x = task_of(), torch.tensor([[1.0, 0.0]], dtype=torch.float64)
@@ -132,6 +133,7 @@ def test_a_margin_makes_up_for_a_mistaken_model() -> None:
     assert passed[0.9] <= 2.0
 
 
+@pytest.mark.apart
 def test_what_nobody_has_planned_is_no_danger() -> None:
     """As the model says, a safe plan stays safe to its end, also where `sweep` looks beyond that."""
     decl = parse_system(Source("cart.yaml", SYSTEM), Path("cart.yaml"))

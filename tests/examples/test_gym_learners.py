@@ -16,6 +16,7 @@ def run(name: str, monkeypatch: pytest.MonkeyPatch, *options: str) -> None:
     runpy.run_path(str(EXAMPLES / name), run_name="__main__")
 
 
+@pytest.mark.apart
 def test_ppo_in_one_file(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("gymnasium")
     run("gym_ppo.py", monkeypatch, "navigation", "--envs", "16", "--updates", "3", "--reward", "task")

@@ -50,6 +50,7 @@ def test_a_task_compiles_and_nothing_is_to_be_said(name: str) -> None:
     assert not lint(File(TASKS / f"{name}.stl").read())
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("name", NAMES)
 def test_a_known_plan_satisfies_the_task(name: str) -> None:
     found = task(name)

@@ -147,6 +147,7 @@ def test_the_header_says_what_values_mean_and_when_requirements_are_known(tmp_pa
     assert "Not judged, as they are assumptions: begin\n   Time step: 0.1 s." in head
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize(("cell", "code"), [(" 2 ", 0), ("", 0), ("nan", 0), ("fast", 2), ("2x", 2)])
 def test_what_is_no_number_is_not_taken_as_unknown(tmp_path: Path, cell: str, code: int) -> None:
     export_monitor(Monitor("signal x\nsignal y\nrequire r: always (x < 9 and y < 9)", dt=1.0), tmp_path)

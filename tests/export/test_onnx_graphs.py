@@ -45,6 +45,7 @@ def test_promises_deepen_as_the_task_says() -> None:
     assert same_verdicts(run.task, Graphs(read_facts(folder)), states=30) <= 1e-9
 
 
+@pytest.mark.apart
 def test_a_begun_plan_is_gone_on_with_where_the_guard_does() -> None:
     run, folder = mission()
     found = previous_plan_agreement(run.policy, Graphs(read_facts(folder)), states=100)
@@ -114,6 +115,7 @@ def test_every_stage_of_a_step_is_rolled(written_out: bool, monkeypatch: pytest.
             now = {**now, **later, "c": np.full(9, 4.0)}
 
 
+@pytest.mark.apart
 def test_a_graph_takes_any_number_of_agents() -> None:
     run, _ = exported("traffic", "car")
     outputs = judging(run.task)

@@ -63,6 +63,7 @@ def test_graphs_in_float32_hold_no_float64(tmp_path: Path) -> None:
         precision_of("float32", "c")
 
 
+@pytest.mark.apart
 def test_the_files_say_what_they_are() -> None:
     run, done = written("traffic", "car")
     assert done.files == (

@@ -119,6 +119,7 @@ def mission_of(folder: Path) -> Run:
     return untrained(folder / "cart.stl", folder / "cart.yaml", folder / "runs")
 
 
+@pytest.mark.apart
 @compiled
 def test_the_c_controller_advances_what_a_mission_adds(tmp_path: Path) -> None:
     run = mission_of(tmp_path)

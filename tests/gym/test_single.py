@@ -21,6 +21,7 @@ ROOT = Path(__file__).parents[2]
 SPECS = ("traffic", "reach_n_avoid", "ship_safe", "ship_track", "navigation", "manipulation")
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("world", [False, True])
 @pytest.mark.parametrize(("name", "normalised"), [*((name, False) for name in SPECS), (SPECS[0], True)])
 @pytest.mark.filterwarnings("ignore:.*(render|symmetric).*:UserWarning")

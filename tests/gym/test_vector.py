@@ -21,6 +21,7 @@ ROOT = Path(__file__).parents[2]
 SPECS = ROOT / "specs"
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("normalised", [False, True])
 @pytest.mark.parametrize("name", stlc.gym.BENCHMARKS)
 def test_what_it_gives_is_in_its_spaces(name: str, normalised: bool) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -38,6 +39,7 @@ def test_a_short_line_is_kept_whole():
     assert extremes(np.zeros(2 * COLUMNS)).tolist() == list(range(2 * COLUMNS))
 
 
+@pytest.mark.apart
 def test_one_violated_sample_of_many_is_in_a_small_picture(tmp_path):
     count = 8_000
     x = np.random.default_rng(0).standard_normal((1, count)) * 0.01

@@ -203,6 +203,7 @@ def test_plans_of_the_guard_keep_their_guarantee_in_rebuilt_plants(seed: int) ->
     assert unguarded(seed, 3) == []
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("seed", range(3))
 def test_no_rebuilt_plant_is_outside(seed: int) -> None:
     assert outside(seed, 3) == []

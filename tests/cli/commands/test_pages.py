@@ -300,6 +300,7 @@ def test_a_command(code, example, arranged, capsys):
         assert f"[{code}]" not in said
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize(("code", "example"), examples("python"))
 def test_a_world(code, example, there, capsys):
     for path in there.rglob("yard.py"):

@@ -24,6 +24,7 @@ from stlc.native import compiler
 pytestmark = pytest.mark.skipif(compiler() is None, reason="there is no C compiler here")
 
 
+@pytest.mark.apart
 def test_every_function_has_the_gradient_of_torch() -> None:
     columns = tuple(ir.Signal(name) for name in NAMES)
     nums: list[ir.Num] = [ir.Op(name, columns[:arity]) for name, arity in OPERATIONS.items()]
@@ -60,6 +61,7 @@ def test_a_remainder_has_the_slope_of_torch_where_the_quotient_rounds_up() -> No
     slopes_agree([ir.Op("mod", (ir.Signal("x"), ir.Signal("y")))], points)
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("soft", [False, True])
 def test_branches_that_are_not_taken_and_are_singular_have_no_gradient(soft: bool) -> None:
     x, y, z = (ir.Signal(name) for name in NAMES)

@@ -62,6 +62,7 @@ def cases(draw: st.DrawFn) -> tuple[Sliding, int]:
     return window, draw(st.sampled_from(BATCHES))
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("operands", [1, 2])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @settings(max_examples=18)

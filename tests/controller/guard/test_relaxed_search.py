@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -56,6 +57,7 @@ def decided(task: Task, x: Tensor) -> GuardDecision:
     return Guard(task, Onward(task), "full", limits=LIMITS).decide(x)
 
 
+@pytest.mark.apart
 def test_what_is_beside_the_wall_stays_as_far_from_it_as_it_is() -> None:
     task, x = cart(), torch.tensor([[1.9, 0.0], [1.7, -0.2]], dtype=torch.float64)
     found = decided(task, x)

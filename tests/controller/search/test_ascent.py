@@ -90,6 +90,7 @@ def test_no_more_is_changed_than_is_enough(car_task: Task) -> None:
     assert (eased > far[brake]).any()
 
 
+@pytest.mark.apart
 def test_a_direction_turns_round(rover_task: Task) -> None:
     turns = [control.squash == "angle" for control in rover_task.system.decl.controls]
     assert any(turns)

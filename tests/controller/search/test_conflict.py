@@ -28,6 +28,7 @@ def test_bounds_prove_what_is_out_of_reach(tmp_path: Path, rule: str, proved: bo
     assert refuted(task(tmp_path, f"require r: {rule}")) is proved
 
 
+@pytest.mark.apart
 def test_only_what_is_proved_is_said_to_have_no_plan(tmp_path: Path) -> None:
     said = conflict(
         task(tmp_path, "require far: eventually[0, T] x > 14 m\nrequire low: always[0, T] x < 9 m")

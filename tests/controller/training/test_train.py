@@ -61,6 +61,7 @@ def test_the_system_file_may_ask_for_a_training_set() -> None:
     assert resolve_config(task, TrainConfig(method="guided")).samples == 0
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("method", ["guided", pytest.param("gradient", marks=pytest.mark.slow)])
 def test_a_killed_and_resumed_run_equals_an_uninterrupted_one(
     car_task: Task, tmp_path: Path, method: str

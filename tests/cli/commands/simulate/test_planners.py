@@ -23,6 +23,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("method", [name for name in PLANNERS.own if name != "policy"])
 def test_every_planner_drives(method: str, capsys: pytest.CaptureFixture[str]) -> None:
     if method in NEEDS:

@@ -80,6 +80,7 @@ def test_the_newest_run_is_simulated_with_and_without_guard(
     assert (there.path / "scene.npz").exists()
 
 
+@pytest.mark.apart
 def test_a_trace_is_judged_by_the_constants_it_was_driven_with(
     there: RunDir, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -43,6 +43,7 @@ def returned(job: Job, seed: int, code: int) -> JobResult:
     return JobResult(job, 0, {"result": result}, "", 1)
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("real", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_every_seed_is_a_run_of_its_own(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *, real: bool

@@ -32,6 +32,7 @@ def at(task: Task, clock: int) -> list[str]:
     return [show_formula(each) for each in Obligations(task).at(state)]
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize(
     "formula",
     [

@@ -63,6 +63,7 @@ def test_a_phase_reaches_its_target_and_stays_safe(handover: Task) -> None:
     assert np.array_equal(phase.plan, again.plan)
 
 
+@pytest.mark.apart
 def test_a_phase_is_short_where_safety_binds_the_way_to_its_target(tmp_path: Path) -> None:
     """The arm goes out only in front of the station, where no sequence of whole turns leads."""
     (tmp_path / "arm.yaml").write_text(
@@ -90,6 +91,7 @@ def test_a_phase_is_short_where_safety_binds_the_way_to_its_target(tmp_path: Pat
     assert max(phase.sample for phase in found) <= 18
 
 
+@pytest.mark.apart
 def test_a_phase_begins_with_what_reached_another_target(tmp_path: Path) -> None:
     (tmp_path / "arm.yaml").write_text(
         "stlc: 1\nname: arm\ntime: {dt: 0.5 s, horizon: 40 s}\n"
