@@ -26,6 +26,7 @@ with stopping.leaving(undo), stopping.leaving(lambda _code: 1 / 0):
 """
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_what_does_not_unwind_is_ended_and_undone(tmp_path: Path, number: int) -> None:
     words = [sys.executable, "-c", STUBBORN, str(tmp_path / "undone")]

@@ -68,6 +68,7 @@ def standing(position: float, count: int = 1) -> Tensor:
     return torch.tensor([[position, 0.0]], dtype=torch.float64).repeat(count, 1)
 
 
+@pytest.mark.apart
 def test_a_plan_that_only_just_stops_in_time_is_replaced_by_one_with_room() -> None:
     """Standing 1 cm before the wall is safe on the model; a gust would push the cart into it."""
     task = task_of("gusts")

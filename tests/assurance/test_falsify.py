@@ -89,6 +89,7 @@ def test_inputs_after_the_last_sample_that_matters_are_not_searched():
     assert (found.found.point[2:10] == 0.5).all() or (found.found.point[3:] == 0.5).all()
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize(("interpolate", "kept"), [("hold", 2), ("linear", 3), ("pchip", 4)])
 def test_exactly_the_values_that_a_requirement_sees_are_searched(interpolate, kept):
     """Always up to 2 s, with values every second: a line from 1 s to 2 s leads to the value at 2 s."""

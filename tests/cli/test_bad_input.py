@@ -71,6 +71,7 @@ def test_initial_states_that_hardly_exist(
     assert all(share in said for share in shares)
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize(
     ("push", "what", "method"),
     [

@@ -93,6 +93,7 @@ PAST = (
 )
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("formula", PAST)
 def test_plans_that_fail_a_formula_of_the_past_are_told_how_to_satisfy_it(
     formula: str, monkeypatch: pytest.MonkeyPatch

@@ -122,6 +122,7 @@ def test_random_formulas_under_sanitizers(written, trace) -> None:
     assert found == [(each.low, each.high) for each in online.finish().values()]
 
 
+@pytest.mark.apart
 def test_a_monitor_in_c_judges_at_every_sample(tmp_path: Path) -> None:
     text = "signal x\nsignal y\nrequire r: always[0, 3 s] (x > -1 or y > 0)\nrequire s: once[0, 2 s] x > 1"
     monitor, rows = Monitor(text, dt=1.0), np.random.default_rng(1).normal(size=(40, 2))

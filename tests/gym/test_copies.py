@@ -37,6 +37,7 @@ def agree(one: Any, other: Any, steps: int) -> None:
         np.testing.assert_array_equal(a[1], b[1])
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize(("name", "world"), [("ship_safe", False), ("ship_safe", True), ("traffic", True)])
 def test_copies_and_pickles_continue_the_episode(name: str, world: bool) -> None:
     env = stlc.gym.make(SPECS / f"{name}.stl", world=world)

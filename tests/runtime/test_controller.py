@@ -65,6 +65,7 @@ def driven(run: Run, folder: Path, mode: str, *, agents: int, steps: int) -> set
     return rules
 
 
+@pytest.mark.apart
 def test_every_decision_is_that_of_the_guard() -> None:
     run, folder = exported("traffic", "car")
     assert driven(run, folder, "none", agents=6, steps=8) == {"policy", "kept"}

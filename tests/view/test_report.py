@@ -136,6 +136,7 @@ def assert_it_needs_nothing_from_outside(page, html):
             assert not re.search(rb'href="(?!#|data:)', content)
 
 
+@pytest.mark.apart
 @pytest.mark.usefixtures("undrawn")
 def test_hostile_texts_stay_texts(trained):
     def hostile(place):

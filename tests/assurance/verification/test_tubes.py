@@ -187,6 +187,7 @@ def check(task: Task, samples: int, *, steps: int | None = None, seed: int = 0, 
     assert bool((rho <= found.high.repeat_interleave(each, 0) + 1e-9).all())
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("scenario", ["all", "choices", "gusts", "mismatch-20", "disturb", "noise"])
 def test_simulations_stay_within_the_tube(scenario: str) -> None:
     check(cart(scenario), 400)

@@ -200,6 +200,7 @@ def undefined(rule: ir.Formula, at: NDArray[np.float64]) -> bool:
     return constant or any(np.isnan(ArrayProgram({"": num})(env, NUMPY)[""]).any() for num in margins)
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("name", ["exact", "smooth", "agm", "dgmsr"])
 def test_gradients_are_finite_and_central_differences(name: str) -> None:
     checked(0, 8, name)

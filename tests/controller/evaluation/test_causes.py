@@ -54,6 +54,7 @@ def driven(folder: Path, rules: str, calm: str):  # type: ignore[no-untyped-def]
     return task, recording, runs
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize(
     ("rules", "calm", "cause", "time"),
     [

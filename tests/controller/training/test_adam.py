@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -58,6 +59,7 @@ def test_steps_are_those_of_torch(seed: int, rates: list[float]) -> None:
     assert all(weight.grad is None for weight in ours)
 
 
+@pytest.mark.apart
 def test_a_step_does_not_import_the_compiler_of_torch() -> None:
     found = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "False"

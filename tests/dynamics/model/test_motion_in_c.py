@@ -21,6 +21,7 @@ Make = Callable[..., System]
 pytestmark = pytest.mark.skipif(compiler() is None, reason="there is no C compiler here")
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("integrator", ["euler", "heun", "rk4", "ros2"])
 @pytest.mark.parametrize("substeps", [1, 3])
 def test_rollouts_of_a_rich_system_equal_torch(make: Make, integrator: str, substeps: int) -> None:

@@ -49,6 +49,7 @@ def there(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
     return RunDir.newest()
 
 
+@pytest.mark.apart
 def test_the_newest_run_is_simulated_with_and_without_guard(
     there: RunDir, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -41,6 +41,7 @@ def test_a_relaxed_plan_has_the_jumps_that_the_goals_need(handover: Task) -> Non
     assert names_of(sequences, possible) == {"grip a"}  # the other part needs a free cart or a filled place
 
 
+@pytest.mark.apart
 def test_a_phase_reaches_its_target_and_stays_safe(handover: Task) -> None:
     x0 = handover.sample(1, seed=0)[0].double()
     sequences = Sequences(handover, x0)
